@@ -79,7 +79,7 @@ def find(study: Study | None) -> Passport | None:
             version=_plain(data["version"]),
             processor=_plain(data["processor"]),
         )
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return None  # not there, or damaged: not verified
 
 

@@ -10,12 +10,14 @@ from typing import NamedTuple
 import jsonschema
 import numpy as np
 import pytest
+from rich.console import Console
 
 import studies
 from studies import passport
 from studies.show.document import schema
+from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import load_study, paper_study, parse_study
-from studies.verify import run
+from studies.verify import commands, loops, run, stepping, trajectories
 from studies.verify.rows import Assumption, largest, worst_relative
 from tests.machines import random_machine
 from tests.test_cli import run as call
@@ -216,6 +218,55 @@ def test_the_copy_without_a_fault_passes(tmp_path):
     assert failed_rows(copied(tmp_path, None), "", 600) == []
 
 
+REST = {"motion": {"waypoints": [[0.0, 0.0, 0.52]]}}
+SMALL = {"link": {"modes": 1}, "control": {"modes": 1}, "patches": {"centers": [0.1]}}
+
+
+@pytest.mark.parametrize("points", [1, 2])
+def test_steps_of_a_machine_at_rest(points):
+    motion = {"waypoints": REST["motion"]["waypoints"] * points}
+    error, order = stepping._steps(parse_study(SMALL | {"motion": motion}))
+    assert error.outcome == "passed" and 0 < error.difference < 1e-6
+    assert order.left_out == "the step is exact to rounding"
+
+
+def test_steps_say_why_their_order_is_left_out():
+    heavy = {"load": {"wrench": [1.0, 0.0, 0.0]}}
+    assert "friction" not in stepping._steps(parse_study(SMALL | heavy))[1].left_out
+
+
+@pytest.mark.parametrize("points", [1, 2])
+def test_machine_code_at_rest(points):
+    motion = {"waypoints": REST["motion"]["waypoints"] * points}
+    row = stepping._kernel(parse_study(SMALL | {"motion": motion}))
+    assert row.outcome == "passed" and row.allowed == 1e-8
+
+
+def test_an_unstable_loop_has_no_linear_run():
+    study = parse_study(SMALL)
+    assert loops._release(study).outcome == "passed"
+    assert "unstable" in loops._release(study.change(control__gain_factor=1e3)).left_out
+
+
+@pytest.mark.parametrize(
+    ("kind", "hertz"), [("zv", [458.0]), ("ei3", [1030.0]), ("zv", [90, 1030])]
+)
+def test_shapers_of_fast_modes(kind, hertz):
+    study = parse_study({"shaper": {"kind": kind, "frequencies_hz": list(map(float, hertz))}})
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    assert trajectories._taps(study, structure, case).outcome == "passed"
+    detuned = study.change(shaper__frequencies_hz=[2 * x for x in hertz])
+    assert trajectories._taps(detuned, structure, case).outcome == "FAILED"
+
+
+@pytest.mark.parametrize("command", ["'", "/bin/false", "no_such_compiler"])
+def test_a_bad_compiler_costs_one_row(command, monkeypatch):
+    monkeypatch.setenv("CC", command)
+    row = loops._exported(parse_study(SMALL))
+    assert row.assumption == "exported C controller"
+    assert row.outcome == ("FAILED" if command == "/bin/false" else "left out")
+
+
 CHEAP = ("links and patches", "trajectories and shapers", "mechanics")
 
 
@@ -236,8 +287,9 @@ def test_random_machines_pass(seed):
         {"link": {"basis": "loaded", "joint_inertia_c": 1.1e-5}, "control": {"law": "lqg"}},
         {"control": {"feedback": "ideal"}, "run": {"duration": 0.7}},
         {"drive": {"coulomb_friction": 1.0}, "control": {"law": "ppf"}},
+        REST | {"drive": {"locked": True}, "initial": {"modal": [[1e-4], [], []]}},
     ],
-    ids=["pinned_free", "loaded", "ideal", "friction"],
+    ids=["pinned_free", "loaded", "ideal", "friction", "locked"],
 )
 def test_other_studies_pass(sections):
     found = run.verify_study(parse_study(sections))
@@ -291,6 +343,18 @@ def test_the_command(checks, capsys, tmp_path):
     assert passport.find(heavy.model_copy(update={"title": "heavy"})).failed == ("x",)
 
 
+@pytest.mark.parametrize(("width", "columns"), [(60, 4), (80, 5), (120, 6)])
+def test_the_table_fits_the_terminal(checks, capsys, width, columns):
+    word = "pinned_pinned"
+    checks["one"] = lambda _: [row(1e-4)._replace(assumption=f"links ({word})", against=word)]
+    console = Console(width=width)
+    commands._print(run.verify_study(), console)
+    table, text = capsys.readouterr().out.split("└")
+    assert f"({word})" in table and "…" not in table and "1 of 1" in text
+    lines = table.splitlines()
+    assert max(map(len, lines)) <= width and lines[3].count("│") == columns + 1
+
+
 def test_a_check_that_cannot_run_fails(checks, capsys):
     def broken(_):
         raise ValueError("no figures")
@@ -303,6 +367,7 @@ def test_a_check_that_cannot_run_fails(checks, capsys):
 def test_a_damaged_outcome_is_none(checks, capsys):
     call(capsys, "verify")
     (file,) = passport.chosen_folder().glob("passport-*")
-    for text in ("", "{", "[1]", '{"title": "", "passed": "many"}'):
+    endless = '{"title": "", "passed": Infinity}'
+    for text in ("", "{", "[1]", '{"title": "", "passed": "many"}', endless, "[" * 100_000):
         file.write_text(text)
         assert passport.find(paper_study()) is None

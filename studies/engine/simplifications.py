@@ -65,7 +65,8 @@ def warn_of_mismatch(study: Study, plant_omega: np.ndarray, model_omega: np.ndar
     error = np.abs(model_omega / nominal - 1) * np.array(study.control.links)[:, None]
     if error.size == 0 or error.max() <= MISMATCH_LIMIT:
         return
-    warn_of_model(f"{mismatch_text(nominal, model_omega, error)}; see control.basis")
+    cause = "control.frequencies_hz" if study.control.frequencies_hz else "control.basis"
+    warn_of_model(f"{mismatch_text(nominal, model_omega, error)}; see {cause}")
 
 
 def mismatch_text(plant_omega: np.ndarray, model_omega: np.ndarray, error: np.ndarray) -> str:

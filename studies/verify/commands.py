@@ -55,11 +55,20 @@ def verify_document(found: ModelVerification) -> dict[str, Any]:
 
 
 def _print(found: ModelVerification, console: Console) -> None:
-    table = Table("assumption", "checked against", "source", "difference", "allowed", "")
+    # what the document has, too, makes room for whole words
+    wide = [
+        name for name, least in (("checked against", 80), ("source", 110)) if console.width >= least
+    ]
+    table = Table()
+    for name in ["assumption", *wide]:
+        table.add_column(name, overflow="fold")
+    for name in ["difference", "allowed", ""]:
+        table.add_column(name, no_wrap=True)
     for row in found.rows:
         numbers = ["-", "-"] if row.left_out else [f"{row.difference:.1e}", f"{row.allowed:.0e}"]
         style = None if row.is_passed else "bold red"
-        table.add_row(row.assumption, row.against, row.source, *numbers, row.outcome, style=style)
+        texts = [row.assumption, row.against, row.source][: 1 + len(wide)]
+        table.add_row(*texts, *numbers, row.outcome, style=style)
     console.print(table)
     for row in found.rows:
         if row.left_out or not row.is_passed:
