@@ -47,7 +47,7 @@ class LoopFigures(NamedTuple):
     gain_margin: Array  # largest common factor on all gains, all smaller ones stable [1], (...)
     spectral_radius: Array = None  # of the closed loop [1], (...)
     breaking_frequency: Array = None  # of what goes unstable at the margin [Hz], (...)
-    breaking: str = ""  # what that is, see `name_motion`; of a single loop
+    breaking: str | None = None  # what that is, see `name_motion`; of a single loop
     # order of the link mode nearest to it, 0: a mode of the platform on its drive; NaN as above,
     # and for the static stiffness
     breaking_mode: Array = None

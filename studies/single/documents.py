@@ -26,7 +26,7 @@ def run_document(run: Run, twin: Run | None) -> dict[str, Any]:
         "metrics": _values(metrics),
         "without_control": free,
         "loop": _values(loop) if loop else None,
-        "breaking": run.loop.breaking if run.loop else "",
+        "breaking": (run.loop.breaking or "") if run.loop else "",
         "residual_delay": float(windows.residual_delay),
         "residual_length": float(windows.residual_length),
         "units": {name: variable.units for name, variable in labelled.items()},

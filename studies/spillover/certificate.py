@@ -204,7 +204,7 @@ def _judge_plants(
             ),
             free_damping=-poles.real / np.abs(poles),
             weakest=_weakest_mode(loop, each[least]),
-            breaking=each[least].breaking,
+            breaking=each[least].breaking or "",
         )
     return judgements
 
