@@ -121,7 +121,12 @@ def render(name: str, /, **values: Any) -> str:
 
 
 def page(
-    name: str, folder: Path | None, appended: Study | Mapping[str, str], /, **values: Any
+    name: str,
+    folder: Path | None,
+    appended: Study | Mapping[str, str],
+    /,
+    about: Study | None = None,
+    **values: Any,
 ) -> str:
     """A report as a self-contained web page.
 
@@ -129,6 +134,7 @@ def page(
         name: of its template.
         folder: with its figures, PNG or GIF; None: a page without images.
         appended: texts to append, by title; or the study reported on, for its file.
+        about: the study whose verification counts; default: the appended one.
         values: of the template.
 
     Returns:
@@ -149,16 +155,16 @@ def page(
         section=section,
         titles=titles,
         image=lambda file, caption: _image(folder, file, caption),
-        facts=config.origin() | _verified(appended),
+        facts=config.origin() | _verified(appended if isinstance(appended, Study) else about),
         files={"Study file": study_template(appended)} if isinstance(appended, Study) else appended,
     )
 
 
-def _verified(appended: Study | Mapping[str, str]) -> dict[str, str]:
+def _verified(study: Study | None) -> dict[str, str]:
     """What `studies verify` found about the study of a report under the present code."""
-    if not isinstance(appended, Study):
+    if study is None:
         return {}
-    found = passport.find(appended)
+    found = passport.find(study)
     return {"verified": found.text if found else "not with this code: `studies verify STUDY`"}
 
 

@@ -135,6 +135,7 @@ def report(
         "sweeps/report.html",
         images,
         {"Sweep file": toml_text(spec.data), "Study of all cases": study_template(spec.study)},
+        about=spec.study,
         title=spec.study.title,
         folder=folder,
         first=direction(metric),

@@ -78,6 +78,7 @@ def report(
         "tuning/report.html",
         images,
         {"Tuning file": toml_text(spec.data), "Study file": study_template(spec.study)},
+        about=spec.study,
         spec=spec,
         tune=spec.tune,
         findings=findings,
