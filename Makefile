@@ -8,10 +8,12 @@ BIN := .venv/bin
 PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 .DEFAULT_GOAL := help
-.PHONY: help study explore docs notebooks test test-long smoke lint check clean venv
+.PHONY: help install study explore docs notebooks test test-long smoke lint check clean venv
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /make \1\t/p' Makefile | expand -t 16
+
+install: .venv/installed  ## set up the environment .venv, nothing else
 
 study: .venv/installed  ## run the study of the paper and a sweep of patch placements
 	$(BIN)/studies paper --out results/paper
@@ -56,7 +58,8 @@ clean:  ## remove the environment, caches and build products; results stay
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 .venv/installed: pyproject.toml constraints.txt
-	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(MAKE) --no-print-directory venv
+	@$(BIN)/python -c 'import pip, sys; sys.exit(sys.prefix == sys.base_prefix)' \
+	  >/dev/null 2>&1 || $(MAKE) --no-print-directory venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile \
 	  -c constraints.txt -e '.[test,dev]'
 	@touch $@
