@@ -253,7 +253,8 @@ def resolution_warning(data: SweepData, cases: np.ndarray, metric: str) -> str:
         return ""
     links = tuple(np.flatnonzero(counted_links(data)).tolist())
     step = least_step(metric, data.baseline["adc_step"].data, links) * _step_share(data)[cases]
-    return resolution_text(metric, metric_values(data, metric)[cases], step, "case")
+    what = "design" if has_environments(data) else "case"
+    return resolution_text(metric, design_values(data, metric)[cases], step, what)
 
 
 def _step_share(data: SweepData) -> np.ndarray:
@@ -275,7 +276,8 @@ def margin_warning(data: SweepData, cases: np.ndarray) -> str:
     low = int(np.sum(margin < ENOUGH))
     if not low:
         return ""
-    which = "this case has" if len(cases) == 1 else f"{low} of these {len(cases)} cases have"
+    what = "design" if has_environments(data) else "case"
+    which = f"this {what} has" if len(cases) == 1 else f"{low} of these {len(cases)} {what}s have"
     return (
         f"CAUTION: {which} a gain margin below {ENOUGH:g} (smallest {np.nanmin(margin):.3g}); such "
         f"loops may go unstable on the machine. Ask for --subject-to '{MARGIN} > {ENOUGH:g}'."
