@@ -19,5 +19,7 @@ def test_environment_left_half_made_is_made_again(tmp_path):
     for name in ("Makefile", "pyproject.toml", "constraints.txt"):
         shutil.copy(ROOT / name, tmp_path)
     command = ["make", "-n", f"PYTHON={sys.executable}", ".venv/installed"]
-    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    run = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60
+    )
     assert "-m venv --clear .venv" in run.stdout
