@@ -7,7 +7,6 @@ numbers: any change to that code, a new version or another cache leaves a machin
 from __future__ import annotations
 
 import json
-import os
 import re
 from contextlib import suppress
 from functools import cache
@@ -17,6 +16,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from studies import sources
 from studies.cache import chosen_folder, is_usable
+from studies.errors import StudyError
+from studies.publish import replacing
 
 if TYPE_CHECKING:
     from studies.study.spec import Study
@@ -57,11 +58,9 @@ def keep(study: Study, passport: Passport) -> None:
     folder = chosen_folder()
     if not is_usable(folder):
         return
-    file = _file(study, folder)
-    part = folder / f".{file.name}.{os.getpid() & 0xFFFFFFFF:08x}.tmp"
-    with suppress(OSError):  # a full disk must not turn a verification into a failure
-        part.write_text(json.dumps(passport._asdict()), encoding="utf-8")
-        part.replace(file)
+    # a full disk must not turn a verification into a failure
+    with suppress(StudyError), replacing(_file(study, folder)) as temporary:
+        temporary.write_text(json.dumps(passport._asdict()), encoding="utf-8")
 
 
 def find(study: Study | None) -> Passport | None:

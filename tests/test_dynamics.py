@@ -65,16 +65,7 @@ def states():
 
 
 def closed_form(plant, motion, loads):
-    chain = dynamics.modal_chain(plant, motion.pose, motion.pose_rate, motion.q, motion.q_rate)
-    return dynamics.accelerations(
-        plant,
-        chain,
-        motion.pose_rate,
-        motion.q,
-        motion.q_rate,
-        loads.slider,
-        loads.modal / plant.modal_mass[:, None],
-    )
+    return reference.closed_form(plant, motion, loads)[1]
 
 
 @jax.jit

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from studies.errors import StudyError
-from studies.sweeps.environments import designs, environments_text, over_environments
+from studies.sweeps.environments import environments_text, over_environments
 from studies.sweeps.show import best_cases, case_rows, margin_warning, ranked_cases
 from tests.test_sweep_tables import made_up, of_links, of_stations
 
@@ -26,10 +26,10 @@ def swept(over="worst", names=("load.mass", "frequency_error"), codes=None, **ch
 
 
 def test_cases_that_differ_in_environments_are_one_design():
-    assert designs(swept()).tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
-    assert designs(swept(names=["load.mass"])).tolist() == [0, 1, 0, 1, 2, 3, 2, 3]
-    assert designs(swept(names=["link.stiffness_factor"])).tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
-    assert designs(swept(names=[])).tolist() == list(range(8))
+    assert swept().designs.tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
+    assert swept(names=["load.mass"]).designs.tolist() == [0, 1, 0, 1, 2, 3, 2, 3]
+    assert swept(names=["link.stiffness_factor"]).designs.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert swept(names=[]).designs.tolist() == list(range(8))
 
 
 @pytest.mark.parametrize(

@@ -88,6 +88,6 @@ def test_the_command(tmp_path, capsys):
     said = refused(capsys, "plant", "paper", "--out", tmp_path / "plant.csv")
     assert "--out" in said and ".json, .npz, .mat" in said
     said = refused(capsys, "plant", "paper", "--out", tmp_path / "none" / "plant.npz")
-    assert "cannot be written" in said
+    assert "cannot write there" in said and "create it first" in said
     with pytest.raises(StudyError, match="control.feedback = 'none'; allowed: 'sampled'"):
         plant_of(parse_study(SHORT | {"control": {"feedback": "none"}}))

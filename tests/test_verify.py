@@ -15,10 +15,10 @@ from rich.console import Console
 import studies
 from studies import passport
 from studies.show.document import schema
-from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import load_study, paper_study, parse_study
 from studies.verify import commands, loops, run, stepping, trajectories
-from studies.verify.rows import Assumption, largest, worst_relative
+from studies.verify.prepared import prepared
+from studies.verify.rows import Assumption, largest, worst, worst_relative
 from tests.machines import random_machine
 from tests.test_cli import run as call
 
@@ -253,10 +253,10 @@ def test_an_unstable_loop_has_no_linear_run():
 )
 def test_shapers_of_fast_modes(kind, hertz):
     study = parse_study({"shaper": {"kind": kind, "frequencies_hz": list(map(float, hertz))}})
-    structure, case = build_structure(study), as_arrays(build_case(study))
-    assert trajectories._taps(study, structure, case).outcome == "passed"
+    _, case, found = prepared(study)
+    assert trajectories._taps(study, case, found.taps).outcome == "passed"
     detuned = study.change(shaper__frequencies_hz=[2 * x for x in hertz])
-    assert trajectories._taps(detuned, structure, case).outcome == "FAILED"
+    assert trajectories._taps(detuned, case, found.taps).outcome == "FAILED"
 
 
 @pytest.mark.parametrize("command", ["'", "/bin/false", "no_such_compiler"])
@@ -313,6 +313,9 @@ def test_what_passes():
     assert largest([1.0, 2.0], [1.0, 4.0]) == 0.5 and worst_relative([1.0, 2.0], [1.0, 4.0]) == 0.5
     assert largest([np.nan], [1.0]) == np.inf and worst_relative([np.nan], [1.0]) == np.inf
     assert largest([1e-3], [0.0]) == 1e-3
+    # the built-in max passes over a NaN that is not first
+    assert worst(0.0, np.nan) == worst(np.nan, 0.0) == worst([0.0, np.nan]) == np.inf
+    assert worst(0.5, [0.1, 2.0]) == 2.0
 
 
 @pytest.fixture

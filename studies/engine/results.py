@@ -32,7 +32,7 @@ from studies.reading import parse_json
 from studies.space.axes import LABELS, SHOWN_AS
 from studies.space.condition import evaluate
 from studies.space.spec import SweepSpec, parse_sweep
-from studies.space.table import CaseTable, build_table, case_ids
+from studies.space.table import CaseTable, build_table, case_ids, designs
 from studies.store import Variable, axis_sizes, read_store, with_coordinates
 from studies.study.fields import Fields
 from studies.study.paths import NAMED_INDEX, known_field, parse_entry
@@ -63,6 +63,11 @@ class SweepData:
         if len(table) != self.n_cases:
             raise StudyError(f"{RESULTS}: {self.n_cases} cases; its sweep has {len(table)}")
         return table
+
+    @cached_property
+    def designs(self) -> np.ndarray:
+        """Number of the design of each case, from 0, (n,): cases apart in environments are one."""
+        return designs(self.table, self.spec.sweep.environments)
 
     @property
     def n_cases(self) -> int:

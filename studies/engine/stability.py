@@ -257,7 +257,7 @@ def judge_loop(loop: SampledLoop, steps: np.ndarray = STEPS) -> LoopFigures:
         gain_margin=margin,
         spectral_radius=float(np.abs(poles(1.0)).max()),
         breaking_frequency=float(abs(np.angle(beyond)) / (2 * np.pi * loop.period)),
-        breaking=breaking_motion(loop, margin),
+        breaking=breaking_motion(loop, margin, beyond),
         frequency_hz=frequency,
         damping_ratio=ratio,
     )
@@ -293,11 +293,9 @@ def pole_beyond(loop: SampledLoop, margin: float) -> complex:
     return complex(poles[np.argmax(np.abs(poles))])
 
 
-def breaking_motion(loop: SampledLoop, margin: float) -> str:
-    """What goes unstable just beyond the margin, "" if that is `HIGHEST`."""
-    if margin >= HIGHEST:
-        return ""
-    return name_motion(loop, breaking_factor(margin), pole_beyond(loop, margin))
+def breaking_motion(loop: SampledLoop, margin: float, beyond: complex) -> str:
+    """What goes unstable just beyond the margin, with `pole_beyond`; "" if that is NaN."""
+    return "" if np.isnan(beyond) else name_motion(loop, breaking_factor(margin), beyond)
 
 
 def follow_modes(

@@ -14,7 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.beam import ModalBasis
+from jaxmodel.dynamics import Accelerations, accelerations, modal_chain
+from jaxmodel.kinematics import Chain
 from jaxmodel.parameters import Geometry, Machine
+from jaxmodel.plant import Plant
 
 
 class RigidState(NamedTuple):
@@ -164,6 +167,21 @@ def inertia(energy: Any, z: Any, z_rate: Any) -> Any:
     mass = jax.hessian(energy, 1)(z, z_rate)
     change = jax.jvp(lambda at: jax.grad(energy, 1)(at, z_rate), (z,), (z_rate,))[1]
     return mass, change - jax.grad(energy)(z, z_rate)
+
+
+def closed_form(plant: Plant, motion: RigidState, loads: Loads) -> tuple[Chain, Accelerations]:
+    """What the forms below are compared with: `jaxmodel.dynamics` at the same state."""
+    chain = modal_chain(plant, *motion)
+    found = accelerations(
+        plant,
+        chain,
+        motion.pose_rate,
+        motion.q,
+        motion.q_rate,
+        loads.slider,
+        loads.modal / plant.modal_mass[:, None],
+    )
+    return chain, found
 
 
 def by_lagrangian(machine: Machine, basis: ModalBasis, motion: RigidState, loads: Loads) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import jax
 import numpy as np
@@ -13,7 +13,9 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.sampled_loop import SampledPlant, sampled_plant
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
-from studies.errors import StudyError, field_error
+from studies.errors import field_error
+from studies.publish import replacing
+from studies.show.document import plain
 from studies.study.spec import Study
 from studies.study.state_space import FORMATS
 
@@ -87,23 +89,17 @@ def write_plant(plant: NamedPlant, path: str | Path) -> None:
     direct = np.zeros((len(plant.c), plant.b.shape[1]))
     content: dict[str, Any] = {"A": plant.a, "B": plant.b, "C": plant.c, "D": direct}
     content |= {"dt": plant.sample_time, "inputs": plant.inputs, "outputs": plant.outputs}
-    part = path.with_name(f".{path.name}.tmp{path.suffix.lower()}")
-    try:
-        _write(content, part)
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise StudyError(f"{path}: cannot be written ({error.strerror})") from None
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        _write(content, path.suffix.lower(), file)
 
 
-def _write(content: dict[str, Any], path: Path) -> None:
-    if path.suffix == ".npz":
-        np.savez(path, **content)
-    elif path.suffix == ".mat":
+def _write(content: dict[str, Any], ending: str, file: BinaryIO) -> None:
+    if ending == ".npz":
+        np.savez(file, **content)
+    elif ending == ".mat":
         import scipy.io
 
         cells = {name: np.array(content[name], object) for name in ("inputs", "outputs")}
-        scipy.io.savemat(path, content | cells)
+        scipy.io.savemat(file, content | cells)
     else:
-        plain = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in content.items()}
-        path.write_text(json.dumps(plain) + "\n", encoding="utf-8")
+        file.write((json.dumps(plain(content)) + "\n").encode())

@@ -93,6 +93,30 @@ def environment_columns(names: Iterable[str], columns: Iterable[str]) -> set[str
     return found
 
 
+def designs(table: CaseTable, environments: Iterable[str]) -> np.ndarray:
+    """Number of the design of each case, from 0, (n,).
+
+    Args:
+        table: the cases.
+        environments: axes in which cases of a design differ; without any, each case is one.
+    """
+    outside = environment_columns(environments, table.columns)
+    if not outside:
+        return np.arange(len(table))
+    codes = [np.zeros(len(table), int)]
+    codes += [_codes(column) for name, column in table.columns.items() if name not in outside]
+    return np.unique(np.stack(codes, axis=1), axis=0, return_inverse=True)[1].ravel()
+
+
+def _codes(column: np.ndarray) -> np.ndarray:
+    """A number for each different value of a column, (n,)."""
+    if column.dtype == object:
+        known: dict[str, int] = {}
+        return np.array([known.setdefault(repr(value), len(known)) for value in column])
+    axis = 0 if column.ndim > 1 else None
+    return np.unique(column, axis=axis, return_inverse=True)[1].ravel()
+
+
 def build_table(spec: SweepSpec) -> CaseTable:
     """Expand a sweep into its cases.
 

@@ -15,7 +15,13 @@ from jaxmodel.simulate import Result, simulate
 from studies.engine.controller import FixedController, fixed_controller
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
-from studies.engine.stability import breaking_motion, follow_modes, gain_margin, modal_damping
+from studies.engine.stability import (
+    breaking_motion,
+    follow_modes,
+    gain_margin,
+    modal_damping,
+    pole_beyond,
+)
 from studies.spillover.certificate import STEPS
 from studies.spillover.laws import Candidate, all_laws
 from studies.spillover.plants import LoopBuilder, PlantVariant, plant_sizes
@@ -116,7 +122,8 @@ class _LawLoops:
                 loop = builder.loop(plant._replace(n_modes=n), part)
                 limit = gain_margin(loop.poles, highest=self.limit)
                 if limit < self.limit:
-                    self.limit, self.breaking = limit, breaking_motion(loop, limit)
+                    self.limit = limit
+                    self.breaking = breaking_motion(loop, limit, pole_beyond(loop, limit))
 
     def margin(self, factor: float) -> float:
         """Smallest margin of all plants with all gains times a factor; 0 if no gains are stable."""

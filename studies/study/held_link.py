@@ -10,7 +10,7 @@ Engineering, 1974).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -35,6 +35,25 @@ def first_frequency(study: Study, with_patches: bool) -> np.ndarray:
     return np.array([_stodola(*_line(study, i, with_patches), inertia[i]) for i in range(3)])
 
 
+def laminate_stiffness(
+    core: float, thickness: float, skin: float, piezo: float, below: Any, above: Any
+) -> Any:
+    """E I of a link with patches on its faces about the neutral axis of all layers [N m2].
+
+    Args:
+        core: axial stiffness E A of the link [N].
+        thickness: of the link [m].
+        skin: axial stiffness of a patch [N].
+        piezo: its thickness [m].
+        below, above: patches on each face [1], of any shape.
+    """
+    height = (thickness + piezo) / 2
+    axial = core + skin * (below + above)
+    first = skin * height * (above - below)
+    second = core * thickness**2 / 12 + skin * (height**2 + piezo**2 / 12) * (below + above)
+    return second - first**2 / axial
+
+
 def _line(study: Study, i: int, with_patches: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points along link i [m], its mass per length there [kg/m] and stiffness E I [N m2]."""
 
@@ -55,14 +74,10 @@ def _line(study: Study, i: int, with_patches: bool) -> tuple[np.ndarray, np.ndar
     piezo, piezo_width = of(patches, "thickness"), of(patches, "width")
     ceramic = of(patches, "density") * piezo_width * piezo
     mass = of(link, "density") * width * thickness + ceramic * (below + above)
-    # layers: axial stiffness per length, height of their middle, own bending stiffness
     core = of(link, "youngs_modulus") * width * thickness
     skin = of(patches, "youngs_modulus") * piezo_width * piezo
-    height = (thickness + piezo) / 2
-    axial = core + skin * (below + above)
-    first = skin * height * (above - below)
-    second = core * thickness**2 / 12 + skin * (height**2 + piezo**2 / 12) * (below + above)
-    return x, mass, (second - first**2 / axial) * of(link, "stiffness_factor")
+    stiffness = laminate_stiffness(core, thickness, skin, piezo, below, above)
+    return x, mass, stiffness * of(link, "stiffness_factor")
 
 
 def _stodola(x: np.ndarray, mass: np.ndarray, stiffness: np.ndarray, joint: np.ndarray) -> float:

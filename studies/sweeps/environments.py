@@ -11,32 +11,11 @@ import numpy as np
 
 from studies.engine.results import SweepData, direction, metric_values
 from studies.show.units import count_text
-from studies.space.table import environment_columns
 
 
 def has_environments(data: SweepData) -> bool:
     """Whether cases are environments of designs."""
     return bool(data.spec.sweep.environments)
-
-
-def designs(data: SweepData) -> np.ndarray:
-    """Number of the design of each case, from 0, (n,)."""
-    if not has_environments(data):
-        return np.arange(data.n_cases)
-    columns = data.table.columns
-    outside = environment_columns(data.spec.sweep.environments, columns)
-    codes = [np.zeros(data.n_cases, int)]
-    codes += [_codes(column) for name, column in columns.items() if name not in outside]
-    return np.unique(np.stack(codes, axis=1), axis=0, return_inverse=True)[1].ravel()
-
-
-def _codes(column: np.ndarray) -> np.ndarray:
-    """A number for each different value of a column, (n,)."""
-    if column.dtype == object:
-        known: dict[str, int] = {}
-        return np.array([known.setdefault(repr(value), len(known)) for value in column])
-    axis = 0 if column.ndim > 1 else None
-    return np.unique(column, axis=axis, return_inverse=True)[1].ravel()
 
 
 def over_environments(data: SweepData, by: str) -> np.ndarray:
@@ -46,7 +25,7 @@ def over_environments(data: SweepData, by: str) -> np.ndarray:
         data: the sweep.
         by: metric or entry of one; with "-" in front, in reverse order.
     """
-    value, own = metric_values(data, by.removeprefix("-")).astype(float), designs(data)
+    value, own = metric_values(data, by.removeprefix("-")).astype(float), data.designs
     sign, over = -1.0 if direction(by) == "largest" else 1.0, data.spec.sweep.over
     count = np.bincount(own)
     if over == "mean":
@@ -75,7 +54,7 @@ def _has_all(value: np.ndarray, own: np.ndarray) -> np.ndarray:
 
 def whole_designs(data: SweepData, chosen: np.ndarray) -> np.ndarray:
     """Cases of the designs of which each case is chosen, (n,)."""
-    own = designs(data)
+    own = data.designs
     return (np.bincount(own, ~chosen) == 0)[own]
 
 
@@ -83,7 +62,7 @@ def one_each(data: SweepData, by: str, cases: np.ndarray) -> np.ndarray:
     """Of each design's cases the one nearest to its value over environments, in their order."""
     value = metric_values(data, by.removeprefix("-")).astype(float)
     gap = np.abs(value - over_environments(data, by))
-    own = designs(data)[cases]
+    own = data.designs[cases]
     order = np.lexsort((gap[cases], own))
     first = np.append(True, np.diff(own[order]) != 0)
     return np.sort(cases[order[first]])
@@ -99,7 +78,7 @@ def environments_text(data: SweepData) -> str:
     """How designs are judged, in a sentence; "" if each case is a design."""
     if not has_environments(data):
         return ""
-    count = np.bincount(designs(data))
+    count = np.bincount(data.designs)
     number = f"{count.max()}" if count.min() == count.max() else f"{count.min()} to {count.max()}"
     names = ", ".join(data.spec.sweep.environments)
     return (

@@ -13,11 +13,11 @@ from jaxmodel.laws import LAWS
 from jaxmodel.linear import resting
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopMatrices, loop_matrices
-from jaxmodel.simulate import simulate
 from studies.engine.controller import fixed_controller
 from studies.engine.margins import judge_loops
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
+from studies.engine.runs import run_study
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.export.c_floating import floating_source
@@ -72,9 +72,6 @@ def _margins(study: Study) -> Assumption:
     )
 
 
-_simulate = kept_jit(static_argnums=(0, 2))(simulate)
-
-
 @kept_jit(static_argnums=0)
 def _linear(structure: Structure, case: Case) -> tuple[LoopMatrices, Any]:
     """The loop at the first way-point, and the volts of the sensors per modal coordinate."""
@@ -117,11 +114,11 @@ def _release(study: Study) -> Assumption:
         initial__modal=((_SMALL,), (), ()),
         initial__load_deflection=(0.0, 0.0, 0.0),
     )
-    structure, case = check_run(released)
-    record = _simulate(structure, case, True).record
+    run = run_study(released, has_loop=False)
+    structure, record = run.structure, run.result.record
     assert record is not None
     matrices, sensor = jax.tree.map(
-        np.asarray, _linear(structure._replace(n_steps=1, substeps=1), case)
+        np.asarray, _linear(structure._replace(n_steps=1, substeps=1), run.case)
     )
     transition, modes = matrices.open + matrices.feedback, 3 * structure.n_modes
     if np.abs(np.linalg.eigvals(transition)).max() > 1 + _GROWTH:

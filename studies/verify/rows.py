@@ -13,7 +13,7 @@ class Assumption(NamedTuple):
     assumption: str
     against: str
     source: str  # author and year
-    difference: float  # relative unless `unit` says otherwise; NaN: it could not be computed
+    difference: float  # relative, or a count; NaN: it could not be computed
     allowed: float
     left_out: str = ""  # why there is nothing to check, "" if there is
     note: str = ""  # what went wrong, or a figure that helps
@@ -31,15 +31,19 @@ class Assumption(NamedTuple):
         return "passed" if self.is_passed else "FAILED"
 
 
+def worst(*differences: Any) -> float:
+    """Largest of differences [1], infinite where one is NaN, which Python's `max` can pass over."""
+    found = max(float(np.max(x)) if not np.any(np.isnan(x)) else np.inf for x in differences)
+    return float(found)
+
+
 def largest(found: Any, wanted: Any) -> float:
     """Largest difference over the largest value wanted [1], NaN counts as infinite."""
     found, wanted = np.asarray(found), np.asarray(wanted)
     size = np.abs(wanted).max()
-    difference = np.abs(found - wanted).max() / (size if size > 0 else 1.0)
-    return float(np.inf if np.isnan(difference) else difference)
+    return worst(np.abs(found - wanted) / (size if size > 0 else 1.0))
 
 
 def worst_relative(found: Any, wanted: Any) -> float:
     """Largest difference entry by entry, over what is wanted there [1]."""
-    difference = np.abs(np.asarray(found) / np.asarray(wanted) - 1).max()
-    return float(np.inf if np.isnan(difference) else difference)
+    return worst(np.abs(np.asarray(found) / np.asarray(wanted) - 1))

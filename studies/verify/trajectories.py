@@ -9,15 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.beam import BASES
-from jaxmodel.case import Case, Structure
+from jaxmodel.case import Case
 from jaxmodel.motion import Path, sample_path
-from jaxmodel.prepare import prepare
 from jaxmodel.shaper import SHAPERS, Taps, design_shaper
 from studies.engine.programs import kept_jit
-from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.held_link import first_frequency
 from studies.study.spec import Study
-from studies.verify.rows import Assumption, largest
+from studies.verify.prepared import prepared
+from studies.verify.rows import Assumption, largest, worst
 
 #: Mode and tolerance for which shapers are designed: any would do.
 _OMEGA, _ZETA, _TOLERANCE = 2 * np.pi * 114.4, 0.02, 0.05
@@ -37,8 +36,8 @@ _INSENSITIVITY = {
 
 def check_trajectories(study: Study) -> list[Assumption]:
     """Reference trajectory, all shapers, and the study's on its sample grid."""
-    structure, case = build_structure(study), as_arrays(build_case(study))
-    return [_path(study, case), _no_vibration(), _insensitivity(), _taps(study, structure, case)]
+    _, case, found = prepared(study)
+    return [_path(study, case), _no_vibration(), _insensitivity(), _taps(study, case, found.taps)]
 
 
 @kept_jit()
@@ -60,17 +59,17 @@ def _path(study: Study, case: Case) -> Assumption:
     }[study.motion.profile]
     length = np.diff(path.waypoints, axis=0)[:, None]
     found = jax.tree.map(np.asarray, _sample(path, time))
-    worst = 0.0
+    apart = [0.0]
     for order, (mine, law) in enumerate(zip(found, laws, strict=True)):
         wanted = law[:, None] * length / path.move_time[:, None, None] ** order
         wanted = wanted + (path.waypoints[:-1, None] if order == 0 else 0.0)
         if wanted.size:
-            worst = max(worst, largest(mine, wanted.reshape(-1, 3)))
+            apart.append(largest(mine, wanted.reshape(-1, 3)))
     return Assumption(
         assumption="reference trajectory, its rates and accelerations",
         against=f"(25) move by move ({study.motion.profile})",
         source="Zhang, Mills and Cleghorn 2016",
-        difference=worst,
+        difference=worst(*apart),
         allowed=1e-9,
         left_out="" if len(path.waypoints) > 1 else "the study does not move",
     )
@@ -101,17 +100,17 @@ def _vibration(
 def _no_vibration() -> Assumption:
     """ZV, ZVD, ZVDD: no vibration at their mode, and none of its derivatives."""
     impulses = jax.tree.map(np.asarray, _shapers(_OMEGA, _ZETA, 0.0))
-    worst, step = 0.0, 1e-3
+    apart, step = [], 1e-3
     for name, order in (("zv", 1), ("zvd", 2), ("zvdd", 3)):
         amplitude, time = (x[list(SHAPERS).index(name)] for x in impulses)
         at, near = _vibration(amplitude, time, np.array([1.0, 1 + step]) * _OMEGA, _ZETA)
         # near the mode, V grows with the power of its zero: pi/2 step for each
-        worst = max(worst, at, abs(amplitude.sum() - 1), near - 1.05 * (np.pi / 2 * step) ** order)
+        apart += [at, abs(amplitude.sum() - 1), near - 1.05 * (np.pi / 2 * step) ** order]
     return Assumption(
         assumption="ZV, ZVD and ZVDD shapers leave no vibration, their order of zero",
         against="free responses of a damped oscillator",
         source="Singer and Seering 1990",
-        difference=worst,
+        difference=worst(*apart),
         allowed=1e-9,
     )
 
@@ -119,29 +118,23 @@ def _no_vibration() -> Assumption:
 def _insensitivity() -> Assumption:
     """Bands with less than 5 % vibration, and the sum of amplitudes."""
     impulses = jax.tree.map(np.asarray, _shapers(_OMEGA, 0.0, _TOLERANCE))
-    ratio, worst = np.linspace(0.2, 1.8, 8001), 0.0
+    ratio, apart = np.linspace(0.2, 1.8, 8001), []
     for name, width in _INSENSITIVITY.items():
         amplitude, time = (x[list(SHAPERS).index(name)] for x in impulses)
         level = _vibration(amplitude, time, ratio * _OMEGA, 0.0)
         found = np.count_nonzero(level <= _TOLERANCE * (1 + 1e-9)) * (ratio[1] - ratio[0])
-        worst = max(worst, abs(found - width) / width, abs(amplitude.sum() - 1))
+        apart += [abs(found - width) / width, abs(amplitude.sum() - 1)]
     return Assumption(
         assumption="insensitivity of ZV, ZVD, ZVDD, EI, two- and three-hump EI shapers",
         against="published bands of 5 % vibration",
         source="Singhose 1996; Vaughan et al. 2008",
-        difference=worst,
+        difference=worst(*apart),
         allowed=0.01,
     )
 
 
-@kept_jit(static_argnums=0)
-def _taps_of(structure: Structure, case: Case) -> Taps:
-    return prepare(structure, case).taps
-
-
-def _taps(study: Study, structure: Structure, case: Case) -> Assumption:
+def _taps(study: Study, case: Case, taps: Taps) -> Assumption:
     """The study's shaper on its sample grid, against its impulses at their own instants."""
-    taps = jax.tree.map(np.asarray, _taps_of(structure, case))
     shaper, time = study.shaper, taps.sample * float(case.electronics.period)
     omega = 2 * np.pi * np.array(_shaped_frequencies(study))
     amplitude, instant = np.ones(1), np.zeros(1)
@@ -157,7 +150,7 @@ def _taps(study: Study, structure: Structure, case: Case) -> Assumption:
         assumption=f"the study's shaper ({shaper.kind}) on its sample grid",
         against="free responses to its impulses off the grid",
         source="Murphy and Watanabe 1992",
-        difference=max(abs(taps.weight.sum() - 1), float(np.abs(left).max())),
+        difference=worst(abs(taps.weight.sum() - 1), np.abs(left)),
         # interpolating e^(j omega t) between samples, once for each shaper in series
         allowed=_DETUNED + omega.size * float(np.max(omega) * case.electronics.period) ** 2 / 8,
         left_out="" if SHAPERS[shaper.kind].length > 1 else "there is no shaper",
