@@ -21,7 +21,7 @@ from studies.export.c_text import Source
 #: Flags with which exported code must compile without warnings.
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 _NAMES = ("cc", "gcc", "clang")
-_ALLOWED = "allowed: a C99 compiler for this machine, named by the variable CC; or --no-verify"
+_ALLOWED = "allowed: a C99 compiler for this machine, named by the variable CC"
 NO_COMPILER = "no C compiler found (the command in the variable CC if it is set, or cc, gcc, clang)"
 
 
