@@ -24,6 +24,7 @@ from studies.config import PACKAGE, configure, keep_programs, start
 from studies.errors import OWN_WARNINGS, StudyError, printable
 from studies.export.commands import add_commands as add_export
 from studies.fitting.commands import add_commands as add_fit
+from studies.laws.commands import add_commands as add_laws
 from studies.paper.commands import add_commands as add_paper
 from studies.show import document
 from studies.show.document import AsJson, print_document
@@ -158,6 +159,7 @@ for add_commands in (
     add_export,
     add_atlas,
     add_spillover,
+    add_laws,
     add_twin,
     add_bench,
 ):

@@ -64,6 +64,9 @@ SWEEPS = Content(
 )
 TUNINGS = Content("a tuning", TUNING, re.compile(r"\..+\.[0-9a-f]{8}\.tmp"))
 ATLASES = Content("an atlas", "runs", re.compile(r"\.unfinished-.*"))
+COMPARISONS = Content(
+    "a comparison of laws", "request.json", re.compile(r"\.unfinished-.*|\..+\.[0-9a-f]{8}\.tmp")
+)
 
 
 class Finished(NamedTuple):

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from studies.engine.blocks import ModalBlocks
+from studies.engine.channels import ActiveChannels
 from studies.engine.controller import FixedController
 from studies.export.fixed import FixedPoint
 from studies.export.fixed_blocks import FixedBlocks
@@ -40,9 +42,10 @@ def cost_of(exported: FixedController, fixed: FixedPoint | FixedBlocks) -> Cost:
     n_taps, k = len(exported.taps.weight), exported.n_patches
     n_channels = k * len(np.unique(exported.channels.link))
     count = _of_blocks if isinstance(fixed, FixedBlocks) else _of_channels
-    products, roundings, words = count(fixed)  # type: ignore[arg-type]
+    roundings, words = count(fixed)  # type: ignore[arg-type]
     # codes to counts; three coordinates of the shaper
-    products, roundings = products + n_channels + 3 * n_taps, roundings + 2 * n_channels + 3
+    products = products_of(exported.channels) + n_channels + 3 * n_taps
+    roundings += 2 * n_channels + 3
     words += 3 * k + 1 + 2 * (3 * (int(exported.taps.sample.max()) + 1) + 1)
     if fixed.wires.feedthrough is not None:
         products, roundings = products + n_channels * k, roundings + n_channels
@@ -53,18 +56,23 @@ def cost_of(exported: FixedController, fixed: FixedPoint | FixedBlocks) -> Cost:
     return Cost(products=products, roundings=roundings, cycles=cycles, load=load, words=words)
 
 
-def _of_channels(fixed: FixedPoint) -> tuple[int, int, int]:
-    """Products, roundings and words of filter, synthesizer and sections."""
-    n, k = fixed.filter.integers.shape
-    direct = int(np.any(fixed.numerator.integers[:, 3]))
-    products, roundings = n * (2 * k + 1 + 2 + 3 + 3 + direct), 5 * n
-    if fixed.energy is not None:
-        products, roundings = products + 10 * n, roundings + 2 * n
-    return products, roundings, 2 * 3 * n
+def products_of(channels: ActiveChannels | ModalBlocks) -> int:
+    """Multiplications of filter, synthesizer and sections in a sample; of blocks, also by 0."""
+    if isinstance(channels, ModalBlocks):
+        system = channels.system
+        return int(sum(x.size for x in (system.state, system.enter, system.leave, system.direct)))
+    n, k = channels.filter.shape
+    switched = 0 if channels.energy is None else 10
+    return n * (2 * k + 1 + 2 + 3 + 3 + bool(np.any(channels.direct)) + switched)
 
 
-def _of_blocks(fixed: FixedBlocks) -> tuple[int, int, int]:
-    """The same of all blocks; every entry counts, also 0."""
-    advance, leave = fixed.advance.integers, fixed.leave.integers
+def _of_channels(fixed: FixedPoint) -> tuple[int, int]:
+    """Roundings and words of filter, synthesizer and sections."""
+    n = len(fixed.filter.integers)
+    return 5 * n + (0 if fixed.energy is None else 2 * n), 2 * 3 * n
+
+
+def _of_blocks(fixed: FixedBlocks) -> tuple[int, int]:
+    """The same of all blocks."""
     states = fixed.state.bits.size
-    return advance.size + leave.size, states + fixed.leave.shift.size, 2 * states
+    return states + fixed.leave.shift.size, 2 * states

@@ -1,0 +1,122 @@
+"""What is compared: each control law on the design's drive, each drive with its law.
+
+Each has its own few numbers: the loop gain, the law's or drive's parameters, and those of the
+study's common settings that its controller depends on.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.bases import find_bases
+from jaxmodel.case import Case, Structure
+from jaxmodel.channels import Channels
+from jaxmodel.laws import LAWS
+from jaxmodel.laws.contract import Law, Parameter
+from jaxmodel.parameters import Array
+from jaxmodel.prepare import design_controller
+from studies.engine.controller import fixed_controller
+from studies.engine.preflight import check_run
+from studies.engine.programs import kept_jit
+from studies.errors import StudyError
+from studies.study.paths import known_field, set_value
+from studies.study.spec import Study, parse_study
+
+#: Numbers are searched within this factor of their start, parameters inside their allowed range.
+REACH = 30.0
+GAIN = "control.gain_factor"
+#: Settings that several laws share, and where they are searched.
+SHARED: dict[str, dict[str, Any]] = {
+    "control.ratios": {"from": 0.0, "to": 3.0},
+    "electronics.highpass_hz": {"from": 5.0, "to": 200.0, "scale": "log"},
+    "electronics.lowpass_ratio": {"from": 0.5, "to": 10.0, "scale": "log"},
+}
+#: How much a setting is changed to see whether a controller depends on it [1].
+NUDGE = 1.01
+
+
+class Candidate(NamedTuple):
+    """A law or a drive, and the numbers it is tuned by."""
+
+    name: str  # in tables
+    law: str  # of LAWS
+    settings: dict[str, Any]  # fields of the study that it sets
+    free: dict[str, dict[str, Any]]  # ranges by field, as in `[tune.free]`
+
+    def study(self, study: Study) -> Study:
+        """The design with this candidate in place of its own."""
+        for name, value in self.settings.items():
+            study = parse_study(set_value(study, name, value))
+        return study
+
+
+def law_candidates(study: Study) -> list[Candidate]:
+    """All laws for which a study needs no matrices of its own, the design's law among them.
+
+    Args:
+        study: the design, with sampled feedback.
+    """
+    return [
+        _law_candidate(study, law)
+        for name, law in LAWS.items()
+        if name == study.control.law or name != "state_space"
+    ]
+
+
+def _law_candidate(study: Study, law: Law) -> Candidate:
+    settings: dict[str, Any] = {"control.law": law.name}
+    if study.control.has_poles and not law.places_poles:
+        settings |= {"control.damping": (), "control.pole_decay": ()}
+    plain = Candidate(law.text, law.name, settings, {})
+    own = plain.study(study)
+    if law.channel == "patch" and law.name != study.control.law:  # its gains have another unit
+        gains = np.array(study.control.velocity_gain) / _strength(*check_run(own))
+        settings["control.velocity_gain"] = tuple(gains.tolist())
+        own = plain.study(study)
+    free = {GAIN: around(own.control.gain_factor)}
+    free |= {name: bounds for name, bounds in SHARED.items() if _depends(own, name)}
+    free |= {f"control.laws.{law.name}.{x.name}": parameter_range(x) for x in law.parameters}
+    return plain._replace(free=free)
+
+
+def around(start: float, low: float = 0.0, high: float = np.inf) -> dict[str, Any]:
+    """The range within `REACH` of a positive start, inside what is allowed."""
+    return {"from": max(start / REACH, low), "to": min(start * REACH, high), "scale": "log"}
+
+
+def parameter_range(parameter: Parameter) -> dict[str, Any]:
+    """Where a law's parameter is searched."""
+    if parameter.default <= 0:
+        return {"from": parameter.low, "to": parameter.high}
+    return around(parameter.default, parameter.low, parameter.high)
+
+
+@kept_jit(static_argnums=0)
+def _strength(structure: Structure, case: Case) -> Array:
+    """Damping of mode 1 of each link by a law's velocity gains of 1 [N s/m], (3,)."""
+    design = design_controller(structure, case, find_bases(structure, case))
+    law, nominal = design.controller.feedback, design.nominal
+    assert isinstance(law, Channels)
+    drives = jnp.einsum("ik,ikc->ic", nominal.actuator[:, 0], law.synthesizer)
+    sees = jnp.einsum("ick,ik->ic", law.filter, nominal.sensor[:, :, 0])
+    return jnp.sum(drives * sees, axis=1)
+
+
+def _depends(study: Study, name: str) -> bool:
+    """Whether the study's controller depends on a setting."""
+    value = known_field(name, study, "laws")
+    nudged = jax.tree.map(lambda x: NUDGE * x, value)
+    changed = parse_study(set_value(study, name, nudged))
+    try:
+        pairs = zip(*map(_leaves, (study, changed)), strict=True)
+    except StudyError:  # this design is not one; its tuning says why
+        return False
+    return any(not np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+
+
+def _leaves(study: Study) -> list[Any]:
+    return jax.tree.leaves(fixed_controller(study).controller)

@@ -1,0 +1,57 @@
+"""The command `studies laws`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from studies.config import start
+from studies.publish import REPORT, announce
+
+
+def add_commands(app: typer.Typer, console: Console) -> None:
+    """Add the command to the command line."""
+
+    @app.command()
+    def laws(
+        design: Annotated[
+            Path, typer.Argument(help="study file, ready-made design, folder of a tuning or sweep")
+        ],
+        out: Annotated[Path, typer.Option(help="folder for report, data and tuned studies")],
+        case: Annotated[
+            str | None,
+            typer.Option(help="case of a sweep (number or id:...) or family of a tuning"),
+        ] = None,
+        voltage: Annotated[
+            float | None,
+            typer.Option(help="largest actuator voltage [V]; default: what the design needs"),
+        ] = None,
+        margin: Annotated[float, typer.Option(help="least disk margin [1]")] = 0.4,
+        resume: Annotated[
+            bool, typer.Option("--resume", help="continue an interrupted run, if there is one")
+        ] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", help="hide progress")] = False,
+    ) -> None:
+        """Compare control laws and drives, each tuned to one budget, on machines they never saw."""
+        from studies.engine.folder import COMPARISONS, refuse_existing
+
+        refuse_existing(out, COMPARISONS, resume)
+        start()
+        from studies.engine.design import load_design
+        from studies.laws.run import run_laws
+        from studies.laws.tuning import make_budget
+
+        study = load_design(design, case).study
+        try:
+            run_laws(study, out, make_budget(study, voltage, margin), resume, console, quiet)
+        except KeyboardInterrupt:
+            print(
+                f"studies: interrupted; finished work is safe; continue with --resume --out {out}",
+                file=sys.stderr,
+            )
+            sys.exit(130)
+        announce(console, out / REPORT)

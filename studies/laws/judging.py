@@ -1,0 +1,138 @@
+"""Tuned controllers on machines and moves that none of them was tuned on.
+
+One sweep, whose environments are the machines and moves: link by link the true stiffness within
+5 %, the platform's mass within 20 %, moves a quarter slower and a fifth faster than the design's,
+each run with its own noise. Every controller meets the same machines.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxmodel import status
+from studies.engine.results import SweepData, metric_values, read_sweep
+from studies.laws.tuning import SPREAD
+from studies.space.spec import SweepSpec, parse_sweep
+from studies.study.consistency import each_link
+from studies.study.paths import known_field
+from studies.study.spec import Study
+
+#: Move times over the design's.
+MOVES = (0.8, 1.0, 1.25)
+MOVE_TIME = "motion.move_time"
+#: Figures of which less is better, by metric, with the words of tables; the first decides.
+FIGURES = {
+    "residual_rms": "residual vibration",
+    "ringing_time": "ringing time",
+    "residual_peak": "residual peak",
+    "control_energy": "control energy",
+}
+#: Others that a table shows.
+SHOWN = ("peak_voltage", "settling_time", "pose_error_peak", "pose_error_rms", "saturated_fraction")
+
+
+class Judged(NamedTuple):
+    """N controllers on M machines in K moves; NaN where a run did not finish."""
+
+    metrics: dict[str, np.ndarray]  # largest over the controlled links, (N, M, K)
+    status: np.ndarray  # code of `jaxmodel.status`, (N, M, K)
+    gain_margin: np.ndarray  # of the loop at rest on each machine [1], (N, M)
+    breaking_mode: np.ndarray  # what goes unstable beyond it, see `LoopFigures`, (N, M)
+
+    @property
+    def n_lost(self) -> np.ndarray:
+        """Runs that did not finish, (N,)."""
+        is_lost = ~np.isin(self.status, status.FINISHED)
+        return np.asarray(is_lost.sum(axis=(1, 2)))
+
+
+def machines_of(study: Study, count: int, seed: int) -> list[dict[str, Any]]:
+    """Machines to judge on: fields of the study and their values, drawn by Latin hypercube.
+
+    Args:
+        study: the design.
+        count: how many machines.
+        seed: of the draw.
+    """
+    from scipy.stats import qmc
+
+    fields = {name: known_field(name, study, "laws") for name in SPREAD}
+    sizes = {name: 3 if name.startswith("link.") else 1 for name in fields}
+    points = qmc.LatinHypercube(sum(sizes.values()), rng=seed).random(count)
+    machines: list[dict[str, Any]] = [{} for _ in range(count)]
+    first = 0
+    for name, value in fields.items():
+        shift = 2 * points[:, first : first + sizes[name]] - 1
+        factor = 1 + SPREAD[name] / 100 * shift
+        first += sizes[name]
+        each = factor * (each_link(value) if sizes[name] == 3 else value)
+        for machine, row in zip(machines, each.tolist(), strict=True):
+            machine[name] = row if sizes[name] == 3 else row[0]
+    return machines
+
+
+def judging_sweep(study: Study, designs: list[Study], machines: list[dict[str, Any]]) -> SweepSpec:
+    """The sweep of designs over machines and moves.
+
+    Args:
+        study: the design that all of them come from.
+        designs: they differ from it in any fields of the controller.
+        machines: from `machines_of`.
+    """
+    times = study.motion.move_time
+    moves = [
+        share * times if isinstance(times, float) else [share * x for x in times] for share in MOVES
+    ]
+    names = [*machines[0], MOVE_TIME]
+    sweep = {
+        "blocks": [
+            {"method": "list", "cases": [changes(study, design) for design in designs]},
+            {"method": "list", "cases": machines},
+            {"method": "list", "cases": [{MOVE_TIME: move} for move in moves]},
+        ],
+        "environments": names,
+        "metrics": [*FIGURES, *SHOWN],
+    }
+    return parse_sweep(study.model_dump() | {"sweep": sweep})
+
+
+def changes(study: Study, design: Study) -> dict[str, Any]:
+    """Fields in which a design differs from a study, by their full names."""
+    return _apart(study.model_dump(), design.model_dump())
+
+
+def _apart(before: dict[str, Any], after: dict[str, Any], path: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, value in after.items():
+        if isinstance(value, dict):
+            found |= _apart(before.get(name, {}), value, f"{path}{name}.")
+        elif value != before.get(name) and path:
+            found[f"{path}{name}"] = value
+    return found
+
+
+def read_judged(folder: Path, n_designs: int, n_machines: int) -> Judged:
+    """Results of the sweep, by design, machine and move."""
+    data = read_sweep(folder)
+    shape = n_designs, n_machines, len(MOVES)
+    origin = data.table.origin  # rows of the design, duplicates included
+
+    def ordered(values: np.ndarray) -> np.ndarray:
+        return np.asarray(values[origin].reshape(shape))
+
+    return Judged(
+        metrics={name: ordered(_values(data, name)) for name in (*FIGURES, *SHOWN)},
+        status=ordered(data["status"]),
+        gain_margin=ordered(data["gain_margin"])[:, :, 0],
+        breaking_mode=ordered(data["breaking_mode"])[:, :, 0],
+    )
+
+
+def _values(data: SweepData, name: str) -> np.ndarray:
+    """A metric of each case; of poses, the distance in the plane."""
+    if name.startswith("pose_error"):
+        return np.asarray(np.hypot(*(data[name][:, k] for k in range(2))))
+    return metric_values(data, name).astype(float)

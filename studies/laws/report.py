@@ -1,0 +1,159 @@
+"""The page of a comparison of laws and drives, and its document."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from studies.laws.findings import LawFindings, verdict
+from studies.laws.judging import FIGURES, MOVES
+from studies.laws.ranking import CONFIDENCE
+from studies.laws.tuning import SPREAD
+from studies.show.pages import page
+from studies.show.sketch import CAPTION
+from studies.show.units import number
+from studies.study.margin import margin_text
+
+#: Columns of the table: metric, its unit, how runs become one number.
+COLUMNS = (
+    ("residual_rms", "m", np.median),
+    ("settling_time", "s", np.median),
+    ("pose_error_rms", "m", np.median),
+    ("peak_voltage", "V", np.max),
+    ("control_energy", "V2 s", np.mean),
+)
+HEADS = (
+    "controller",
+    "residual rms, median [µm]",
+    "over the best (95 %)",
+    "settling, median [ms]",
+    "platform error, median [µm]",
+    "largest voltage [V]",
+    "control energy, mean [V² s]",
+    "gain margin, worst [1]",
+    "breaks first (nominal machine)",
+    "products a sample",
+    "numbers tuned",
+    "note",
+)
+
+
+def report(findings: LawFindings, images: Path | None = None) -> str:
+    """The page.
+
+    Args:
+        findings: of the comparison.
+        images: folder with the figures; None: a page without.
+    """
+    machines, moves = findings.judged.status.shape[1:]
+    return page(
+        "laws/report.html",
+        images,
+        findings.study,
+        findings=findings,
+        study=findings.study,
+        budget=findings.budget,
+        verdict=verdict(findings),
+        heads=HEADS,
+        rows=[_row(findings, k) for k in _order(findings)],
+        failed=findings.failed,
+        machines=machines,
+        moves=moves,
+        times=MOVES,
+        spread=SPREAD,
+        confidence=CONFIDENCE,
+        figures=FIGURES,
+        sketch_caption=CAPTION,
+    )
+
+
+def _order(findings: LawFindings) -> list[int]:
+    """Controllers as the table has them: the competition, best first, then the others."""
+    rows = findings.competing
+    ranked = [rows[k] for k in findings.ranking.order]
+    return ranked + [k for k in range(len(findings.controllers)) if k not in ranked]
+
+
+def _row(findings: LawFindings, k: int) -> list[str]:
+    controller, judged = findings.controllers[k], findings.judged
+    values = {name: _over(judged.metrics[name][k], over) for name, _, over in COLUMNS}
+    lost = int(judged.n_lost[k])
+    note = "; ".join(filter(None, (controller.reason, f"{lost} runs lost" if lost else "")))
+    loop = controller.loop
+    margins = judged.gain_margin[k]
+    has_margin = loop is not None and np.isfinite(margins).any()
+    return [
+        controller.name,
+        number(values["residual_rms"], "m"),
+        _ratio(findings, k),
+        number(values["settling_time"], "s"),
+        number(values["pose_error_rms"], "m"),
+        number(values["peak_voltage"], "V"),
+        f"{values['control_energy']:.3g}",
+        margin_text(float(np.nanmin(margins))) if has_margin else "-",
+        (loop.breaking or "-") if loop is not None else "-",
+        "-" if controller.products is None else str(controller.products),
+        str(controller.n_free),
+        note or "-",
+    ]
+
+
+def _over(values: np.ndarray, over: Any) -> float:
+    finite = values[np.isfinite(values)]
+    return float(over(finite)) if finite.size else float("nan")
+
+
+def _ratio(findings: LawFindings, k: int) -> str:
+    """Ratio to the best, with its interval, of a controller in the competition."""
+    rows, ranking = findings.competing, findings.ranking
+    if k not in rows or not np.isfinite(ranking.ratio[rows.index(k)]):
+        return "-"
+    place = rows.index(k)
+    if place == ranking.best:
+        return "1"
+    return (
+        f"{ranking.ratio[place]:.2f} ({ranking.low[place]:.2f} to {ranking.high[place]:.2f})"
+        f"{', tied' if ranking.is_tied[place] else ''}"
+    )
+
+
+def document(findings: LawFindings) -> dict[str, Any]:
+    """The same as numbers in SI units."""
+    return {
+        "format": "flexlink-laws",
+        "format_version": 1,
+        "title": findings.study.title,
+        "budget": findings.budget._asdict(),
+        "verdict": verdict(findings),
+        "controllers": [_entry(findings, k) for k in _order(findings)],
+        "failed": [{"name": x.candidate.name, "reason": x.reason} for x in findings.failed],
+        "study": findings.study.model_dump(mode="json"),
+    }
+
+
+def _entry(findings: LawFindings, k: int) -> dict[str, Any]:
+    controller, judged = findings.controllers[k], findings.judged
+    rows = findings.competing
+    entry: dict[str, Any] = {
+        "name": controller.name,
+        "reason": controller.reason,
+        "numbers_tuned": controller.n_free,
+        "products": controller.products,
+        "gain_margin": _number(_over(judged.gain_margin[k], np.min)),
+        "breaking": "" if controller.loop is None else controller.loop.breaking,
+        "runs_lost": int(judged.n_lost[k]),
+    }
+    entry |= {name: _number(_over(judged.metrics[name][k], over)) for name, _, over in COLUMNS}
+    if k in rows:
+        place = rows.index(k)
+        entry["ratio"] = {
+            metric: [_number(x[place]) for x in (ranking.ratio, ranking.low, ranking.high)]
+            for metric, ranking in findings.rankings.items()
+        }
+    return entry
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,173 @@
+"""`studies laws`: tune every candidate, judge all, rank them, write the page.
+
+`tuning/` has the progress of each tuning and `runs/` the sweep that judges, so that an interrupted
+comparison goes on where it was. `request.json` says what was asked for.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from studies import config
+from studies.engine.folder import COMPARISONS, locked_folder, make_manifest, refuse_existing
+from studies.engine.progress import Phases
+from studies.engine.runs import resolved_study
+from studies.engine.sweep import run_sweep, sweep_phases
+from studies.errors import StudyError, field_error
+from studies.laws import plots
+from studies.laws.candidates import law_candidates
+from studies.laws.findings import GIVEN, WITHOUT, LawFindings, examine, find, verdict
+from studies.laws.judging import judging_sweep, machines_of, read_judged
+from studies.laws.report import document, report
+from studies.laws.tuning import Budget, Tuned, tune_candidate
+from studies.publish import REPORT, publish, replacing
+from studies.reading import read_json
+from studies.show.figures import save, styled, write_figure
+from studies.show.sketch import sketch
+from studies.space.spec import SweepSpec
+from studies.study.spec import Study
+from studies.study.template import study_template
+from studies.study.window import with_window
+
+DOCUMENT, TUNING, RUNS = "laws.json", "tuning", "runs"
+#: Machines to judge on.
+MACHINES = 16
+
+
+def run_laws(
+    study: Study,
+    out: str | Path,
+    budget: Budget,
+    is_resumed: bool = False,
+    console: Console | None = None,
+    is_quiet: bool = False,
+) -> LawFindings:
+    """Compare all laws and drives on a design's machine.
+
+    Args:
+        study: the design, with sampled feedback.
+        out: folder.
+        budget: what each candidate may spend.
+        is_resumed: continue an interrupted comparison.
+        console: where progress goes; default: standard output.
+        is_quiet: hide progress.
+
+    Raises:
+        StudyError: a fault of the design or the folder; no candidate can be tuned.
+        KeyboardInterrupt: Ctrl-C; what is finished stays.
+    """
+    config.require_configured()
+    out, console = Path(out), console or Console(highlight=False, markup=False)
+    if study.control.feedback != "sampled" or not study.is_controlled:
+        raise field_error(
+            "control.feedback",
+            study.control.feedback,
+            "'sampled', with a controlled link: what is compared is a sampled controller",
+        )
+    study = with_window(resolved_study(study))
+    with locked_folder(out, "comparison"):
+        refuse_existing(out, COMPARISONS, is_resumed)
+        _keep_request(out / COMPARISONS.mark, study, budget)
+        names = ("tune", *sweep_phases(_empty_sweep(study)), "rank", "draw")
+        with Phases(console, names, is_quiet) as phases:
+            return _compare(study, out, budget, phases)
+
+
+def _keep_request(file: Path, study: Study, budget: Budget) -> None:
+    """Write what is asked for, or check that the folder's is the same.
+
+    Raises:
+        StudyError: it is not.
+    """
+    request = json.loads(
+        json.dumps(make_manifest(study.model_dump(mode="json"), DECISIVE) | budget._asdict())
+    )
+    if file.is_file():
+        try:
+            before = read_json(file)
+        except (OSError, ValueError):
+            before = None
+        if not isinstance(before, dict) or any(
+            before.get(key) != request[key] for key in ("spec", "code", *Budget._fields)
+        ):
+            raise StudyError(
+                f"--out {file.parent}: was begun with another design, budget or program; name a "
+                "new folder"
+            )
+        return
+    with replacing(file) as temporary:
+        temporary.write_text(json.dumps(request, indent=1), encoding="utf-8")
+
+
+#: Modules that determine the numbers, with everything they import.
+DECISIVE = ("studies.laws.tuning", "studies.laws.judging", "studies.laws.candidates")
+
+
+def _empty_sweep(study: Study) -> SweepSpec:
+    return judging_sweep(study, [study], machines_of(study, 1, 0))
+
+
+def _compare(study: Study, out: Path, budget: Budget, phases: Phases) -> LawFindings:
+    tuned = _tune(study, out, budget, phases)
+    whole = [x for x in tuned if x.study is not None]
+    if not whole:
+        raise StudyError("laws: no candidate can be tuned; " + tuned[0].reason)
+    entries: list[tuple[str, Study, Tuned | None]] = [
+        (WITHOUT, study.uncontrolled(), None),
+        (GIVEN, study, None),
+        *((x.candidate.name, x.study, x) for x in whole if x.study is not None),
+    ]
+    machines = machines_of(study, MACHINES, budget.seed + 1)
+    spec = judging_sweep(study, [one for _, one, _ in entries], machines)
+    is_begun = (out / RUNS).exists()
+    if run_sweep(spec, out / RUNS, is_begun, phases=phases).is_interrupted:
+        raise KeyboardInterrupt
+    phases.begin("rank", "loops of the nominal machine")
+    judged = read_judged(out / RUNS, len(entries), MACHINES)
+    controllers = [examine(*entry) for entry in entries]
+    findings = find(study, budget, tuned, judged, controllers)
+    phases.begin("draw")
+    _write(findings, out)
+    for line in verdict(findings):
+        phases.say(line)
+    return findings
+
+
+def _tune(study: Study, out: Path, budget: Budget, phases: Phases) -> list[Tuned]:
+    """Each candidate, tuned or not."""
+    phases.begin("tune", "what each law and drive can be tuned by")
+    candidates, folder, tuned = law_candidates(study), out / TUNING, []
+    folder.mkdir(exist_ok=True)
+    for k, candidate in enumerate(candidates):
+
+        def say(text: str, k: int = k, name: str = candidate.name) -> None:
+            phases.advance(k, len(candidates), f"{name} ({k + 1} of {len(candidates)}): {text}")
+
+        say("compile")
+        one = tune_candidate(study, candidate, budget, folder / f"{_slug(candidate.name)}.npz", say)
+        tuned.append(one)
+    return tuned
+
+
+def _slug(name: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+
+
+def _write(findings: LawFindings, out: Path) -> None:
+    with publish(out) as staging:
+        for controller in findings.controllers[2:]:
+            file = staging / f"{_slug(controller.name)}.toml"
+            title = f"{findings.study.title or 'study'}: {controller.name}"[:200]
+            named = controller.study.model_copy(update={"title": title})
+            file.write_text(study_template(named), encoding="utf-8")
+        with styled():
+            save(plots.comparison(findings), staging, "laws")
+            write_figure(sketch(findings.study), staging / "machine.png")
+        described: dict[str, Any] = document(findings)
+        (staging / DOCUMENT).write_text(json.dumps(described, indent=1), encoding="utf-8")
+        (staging / REPORT).write_text(report(findings, staging), encoding="utf-8")

@@ -1,0 +1,152 @@
+"""Each candidate tuned to one budget: as little residual vibration as it can under equal limits.
+
+The same largest voltage, the same disk margin, as many starting points and iterations. A tuning is
+kept in its own file after every iteration, so that an interrupted comparison continues there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxmodel import status
+from studies.engine.runs import run_study
+from studies.errors import StudyError, field_error
+from studies.laws.candidates import Candidate
+from studies.study.labels import describe
+from studies.study.spec import Study
+from studies.tuning.check import tuned_study
+from studies.tuning.folder import load_progress, save_progress
+from studies.tuning.optimise import Progress, is_compatible, optimise
+from studies.tuning.run import make_evaluator
+from studies.tuning.spec import TuneSpec, parse_tuning
+
+#: What is minimised: the residual vibration of the controlled links.
+OBJECTIVE = "residual_rms"
+#: Spread of the machines, the same as those of `judging`: those there are others.
+SPREAD = {"link.stiffness_factor": 5.0, "machine.platform_mass": 20.0}
+#: The limit on the loop.
+MARGIN = "disk_margin"
+
+
+class Budget(NamedTuple):
+    """What every candidate may spend."""
+
+    voltage: float  # largest of an actuator [V]
+    margin: float  # least disk margin [1]
+    starts: int = 4
+    iterations: int = 20
+    machines: int = 2  # of a tuning, the design's own among them
+    seed: int = 0
+
+
+def make_budget(study: Study, voltage: float | None, margin: float) -> Budget:
+    """A budget from the command line.
+
+    Args:
+        study: the design.
+        voltage: largest of an actuator [V]; None: what the design itself needs in its motion.
+        margin: least disk margin [1].
+
+    Raises:
+        StudyError: out of range; a design that does not finish its motion.
+    """
+    if not 0 < margin < 2:
+        raise field_error("--margin", margin, "a disk margin > 0 and < 2", "1")
+    limit = study.electronics.voltage_limit
+    if voltage is not None and not 0 < voltage <= limit:
+        raise field_error("--voltage", voltage, f"> 0 and <= {limit:g}, the actuators' limit", "V")
+    if voltage is None:
+        run = run_study(study)
+        if run.status not in status.FINISHED:
+            raise StudyError(f"--voltage: the design ends with {describe(run.status)}; name one")
+        voltage = float(np.max(run.result.metrics.peak_voltage))
+        if voltage == 0:
+            raise StudyError("--voltage: the design uses none; name one")
+    return Budget(float(voltage), margin)
+
+
+class Tuned(NamedTuple):
+    """A candidate after its tuning."""
+
+    candidate: Candidate
+    study: Study | None  # with its best numbers; None: no run of it finished
+    reason: str  # why there is none, or which limit it does not keep; "" if all is well
+    objective: float  # over that of the design as given [1]
+    n_free: int  # numbers it was tuned by
+    runs: int  # of the tuning
+
+
+def tuning_of(study: Study, candidate: Candidate, budget: Budget) -> TuneSpec:
+    """The tuning of a candidate.
+
+    Raises:
+        StudyError: the design with this candidate is not valid.
+    """
+    tune: dict[str, Any] = {
+        "free": candidate.free,
+        "objective": {OBJECTIVE: 1.0},
+        "limits": {"peak_voltage": budget.voltage, MARGIN: budget.margin},
+        "families": {"tuned": {"set": candidate.settings}},
+        "starts": budget.starts,
+        "iterations": budget.iterations,
+        "seed": budget.seed,
+        "scenarios": {"count": budget.machines, "seed": budget.seed, "spread": SPREAD},
+    }
+    return parse_tuning(study.model_dump() | {"tune": tune})
+
+
+def tune_candidate(
+    study: Study,
+    candidate: Candidate,
+    budget: Budget,
+    file: Path,
+    say: Callable[[str], None],
+) -> Tuned:
+    """Tune a candidate, or go on where its file ends.
+
+    Args:
+        study: the design.
+        candidate: what is tuned.
+        budget: what it may spend.
+        file: of its progress.
+        say: called with the progress of each iteration.
+    """
+    try:
+        spec = tuning_of(study, candidate, budget)
+        at = _optimised(spec, file, say)
+    except StudyError as error:
+        return Tuned(candidate, None, str(error), np.nan, len(candidate.free), 0)
+    best, family = at.winner(0), spec.moving[0]
+    count, runs = int(family.is_free.sum()), int(at.iteration) * budget.starts * budget.machines
+    objective = float(at.best_objective[best])
+    if not np.isfinite(objective):
+        return Tuned(candidate, None, "no start finished a run", np.nan, count, runs)
+    tuned = tuned_study(spec, family, spec.free.values(at.best_place[best]))
+    return Tuned(candidate, tuned, _violated(spec, at, best), objective, count, runs)
+
+
+def _optimised(spec: TuneSpec, file: Path, say: Callable[[str], None]) -> Progress:
+    """Progress at the end of a tuning, which its file keeps."""
+    before = load_progress(file)
+    if before is not None and not is_compatible(spec, before):
+        raise StudyError(f"{file}: damaged; delete it")
+
+    def keep(at: Progress) -> None:
+        save_progress(file, at)
+        best = at.best_objective[at.winner(0)]
+        say(f"{int(at.iteration)}/{spec.tune.iterations}: {best:.3f} of the design's residual")
+
+    return optimise(spec, make_evaluator(spec), before, keep)
+
+
+def _violated(spec: TuneSpec, at: Progress, best: int) -> str:
+    """The limits that the best numbers do not keep, and by how much."""
+    if at.beyond(best) == 0:
+        return ""
+    worst = int(np.argmax(at.best_limits[best]))
+    share = 100 * at.best_limits[best][worst]
+    return f"{spec.limit_names[worst]} violated by {share:.2g} %"
