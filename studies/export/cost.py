@@ -67,4 +67,7 @@ def _of_blocks(fixed: FixedBlocks) -> tuple[int, int, int]:
     """The same of all blocks; every entry counts, also 0."""
     advance, leave = fixed.advance.integers, fixed.leave.integers
     states = fixed.state.bits.size
-    return advance.size + leave.size, states + fixed.leave.shift.size, 2 * states
+    products, roundings = advance.size + leave.size, states + fixed.leave.shift.size
+    if fixed.anti_windup is not None:
+        products, roundings = products + fixed.anti_windup.integers.size, roundings + states
+    return products, roundings, 2 * states
