@@ -66,6 +66,10 @@ class Channels(NamedTuple):
                 force = force * strongest(self.rival_omega, value, rate)
         return state, jnp.sum(self.synthesizer * force[:, None], axis=2)
 
+    def limited(self, state: FilterState, change: Array) -> FilterState:
+        """The next state: what limits change does not matter to filters of sensors."""
+        return state
+
     def amplified(self, factor: Array) -> Channels:
         """All gains times a factor: one for all, or one for each channel, (3, C)."""
         position = self.position_gain

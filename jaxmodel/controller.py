@@ -162,4 +162,5 @@ def controller_step(
     own = jnp.sum(controller.feedthrough * state.voltage[:, None], axis=2)
     after, demand = controller.feedback.step(state.feedback, measured - own)
     command = soft_limit(demand, controller.voltage_limit, is_smooth)
+    after = controller.feedback.limited(after, command - demand)
     return ControllerState(after, command), ControllerInfo(measured, command, is_clipped)

@@ -1,5 +1,9 @@
 """Linear controllers of any order: x_(k+1) = A x_k + B y_k, u_k = C x_k + D y_k, A in blocks.
 
+Where a command is limited to v_k, E (v_k - u_k) is added to x_(k+1): with E the effect of a command
+on what an observer predicts, it predicts with the command as it was applied, and does not wind up
+(the observer form of anti-windup, Astrom and Rundqwist 1989).
+
 One system for all links together, or one for each link. With blocks of 2x2, the real modal form
 (`modal_form`), a sample costs O(order x channels). Shapes: structure first, lanes last.
 """
@@ -24,6 +28,7 @@ class StateSpace(NamedTuple):
     enter: Array  # B, state per sensor volt, (G, N, b, M)
     leave: Array  # C, actuator volts per state, (G, M, N, b)
     direct: Array  # D [1], (G, M, M)
+    anti_windup: Array | None = None  # E, state per volt that a limit adds, (G, N, b, M); None: 0
 
     @property
     def acting(self) -> np.ndarray:
@@ -71,12 +76,35 @@ class StateSpace(NamedTuple):
         demand = demand + jnp.sum(self.direct * y[:, None], axis=2)
         return after, jnp.reshape(demand, voltage.shape)
 
+    def limited(self, state: Array, change: Array) -> Array:
+        """The next state, told what the limits changed.
+
+        Args:
+            state: from `step`.
+            change: of the voltages wanted, by limits [V], (3, K).
+        """
+        if self.anti_windup is None:
+            return state
+        volts = jnp.reshape(change, (state.shape[0], -1, *change.shape[2:]))
+        return state + jnp.sum(self.anti_windup * volts[:, None, None], axis=3)
+
     def amplified(self, factor: Array) -> StateSpace:
-        """Outputs times a factor: one for all, or one for each actuator, (3, K)."""
+        """Outputs times a factor: one for all, or one for each actuator, (3, K).
+
+        A factor is taken for one of the machine: the state is told of limits as if it had not been
+        there, E (v - u)/factor.
+        """
         groups, size = self.direct.shape[:2]
         each = jnp.reshape(jnp.broadcast_to(factor, (3, groups * size // 3)), (groups, size))
+        tell = self.anti_windup
+        if tell is not None:
+            is_on = each != 0
+            share = jnp.where(is_on, 1 / jnp.where(is_on, each, 1.0), 0.0)
+            tell = tell * share[:, None, None]
         return self._replace(
-            leave=self.leave * each[:, :, None, None], direct=self.direct * each[:, :, None]
+            leave=self.leave * each[:, :, None, None],
+            direct=self.direct * each[:, :, None],
+            anti_windup=tell,
         )
 
     def with_sensors(self, factor: Array) -> StateSpace:

@@ -82,7 +82,11 @@ def test_poles_can_be_free():
         "pole_frequency_hz": [[120.0], [121.0], [122.0]],
     }
     spec = parse_tuning({**SMALL, "control": control, "tune": {"free": free}})
-    assert len(spec.free.names) == 5 and spec.has_poles and spec.has_position_gain
+    assert (
+        len(spec.free.names) == 5
+        and spec.has_poles(spec.law())
+        and spec.has_position_gain(spec.law())
+    )
     values = np.array([10.0, 20.0, 30.0, 40.0, 100.0])
     moved = placed(spec, values).control
     np.testing.assert_array_equal(moved.pole_decay[:, :2], [[10, 20], [30, 0], [40, 0]])
@@ -99,7 +103,7 @@ def test_added_damping_can_be_free():
     ):
         control = {**SMALL["control"], "damping": damping}
         spec = parse_tuning({**SMALL, "control": control, "tune": {"free": free}})
-        assert spec.has_poles and spec.has_position_gain
+        assert spec.has_poles(spec.law()) and spec.has_position_gain(spec.law())
         control = placed(spec, values).control
         np.testing.assert_allclose(control.damping[:, :2], moved, atol=1e-15)
 

@@ -121,12 +121,15 @@ def _shapes(feedback: Feedback, n_channels: int, n_patches: int) -> dict[str, tu
     groups, n, b = jnp.shape(feedback.state)[:3]
     groups = 1 if groups == 1 else 3
     size = 3 * n_patches // groups
-    return {
+    shapes = {
         "state": (groups, n, b, b),
         "enter": (groups, n, b, size),
         "leave": (groups, size, n, b),
         "direct": (groups, size, size),
     }
+    if feedback.anti_windup is not None:
+        shapes["anti_windup"] = (groups, n, b, size)
+    return shapes
 
 
 def acting_channels(case: Case, nominal: NominalModel) -> Array:

@@ -168,6 +168,8 @@ def compensated(
 ) -> StateSpace:
     """u = -K x of an observer's state x, corrected with the sample at hand.
 
+    It predicts with the command as it is limited.
+
     Args:
         structure, case: of the law.
         model: of each link, leading axis 3.
@@ -181,5 +183,6 @@ def compensated(
         enter=(after @ correct)[:, None],
         leave=-(gain @ kept)[:, :, None],
         direct=-(gain @ correct),
+        anti_windup=model.enter[:, None],
     )
     return system_feedback(structure, case, system)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from jaxmodel.case import Case, Structure
+from jaxmodel.laws.bending import BENDING, bent, walk
 from jaxmodel.laws.contract import Law, NominalModel, Parameter
 from jaxmodel.laws.link_model import DAMPING, LinkModel, compensated, link_model
 from jaxmodel.lazy import jax, jnp
@@ -17,17 +18,25 @@ def design(structure: Structure, case: Case, nominal: NominalModel) -> StateSpac
     weights = (
         jnp.asarray(parameters[x]) for x in ("voltage_weight", "disturbance", "sensor_noise")
     )
+    weight, force, noise = weights
     model = link_model(structure, case, nominal)
+    wide = bent(case, model)
+    patches, n = model.sensor.shape[1:]
+    eye = jnp.eye(patches)
 
-    def one(model: LinkModel, weight: Array, force: Array, noise: Array) -> tuple[Array, Array]:
-        eye = jnp.eye(model.enter.shape[1])
-        gain = regulator_gain(model.state, model.enter, jnp.diag(model.energy), weight * eye)
+    def regulate(model: LinkModel, weight: Array) -> Array:
+        return regulator_gain(model.state, model.enter, jnp.diag(model.energy), weight * eye)
+
+    def correct(model: LinkModel, force: Array, change: Array, noise: Array) -> Array:
         shaken = force * model.drive
-        correct = filter_gain(model.state, model.sensor, shaken @ shaken.T, noise**2 * eye)
-        return gain, correct
+        slow = change**2 * (jnp.arange(model.state.shape[0]) >= n)
+        return filter_gain(
+            model.state, model.sensor, shaken @ shaken.T + jnp.diag(slow), noise**2 * eye
+        )
 
-    gain, correct = jax.vmap(one)(model, *weights)
-    return compensated(structure, case, model, gain, correct)
+    gain = wide.relative(jax.vmap(regulate)(model, weight))
+    correction = jax.vmap(correct)(wide.model, force, walk(case, force), noise)
+    return compensated(structure, case, wide.model, gain, correction)
 
 
 LQG = Law(
@@ -55,6 +64,7 @@ LQG = Law(
         Parameter(
             "sensor_noise", 5e-3, "V", "rms of the sensors' noise that it expects", 1e-6, 1e2
         ),
+        BENDING,
         DAMPING,
     ),
     has_position=False,

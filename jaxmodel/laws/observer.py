@@ -12,6 +12,7 @@ from __future__ import annotations
 from functools import reduce
 
 from jaxmodel.case import Case, Structure
+from jaxmodel.laws.bending import BENDING, bent, force_decay
 from jaxmodel.laws.contract import Law, NominalModel, Parameter, acting_channels
 from jaxmodel.laws.link_model import (
     DAMPING,
@@ -27,38 +28,52 @@ from jaxmodel.parameters import Array
 from jaxmodel.state_space import StateSpace
 
 
-def corrections(structure: Structure, case: Case, nominal: NominalModel, state: Array) -> Array:
-    """Corrections of each mode's own states by its residual in z, (3, C, s), s = 4 or 5.
+def corrections(structure: Structure, case: Case, nominal: NominalModel) -> Array:
+    """Corrections of each mode's own states by its residual in z, (3, C, s), s = 5 or 6.
 
-    Ackermann's formula for the predictor, L = phi(F) O^-1 e_s, and M = F^-1 L for the corrector.
+    Mode, filters and, last, the slow force that bends it (`laws.bending`). Ackermann's formula for
+    the predictor, L = phi(F) O^-1 e_s, and M = F^-1 L for the corrector.
 
     Args:
         structure, case, nominal: of the law.
-        state: F of each link, (3, n, n).
     """
-    electronics, count = case.electronics, structure.n_controlled
-    size = 5 if structure.has_sensor_highpass else 4
-    period = electronics.period
+    electronics, period = case.electronics, case.electronics.period
     filters = [electronics.antialias * jnp.sqrt(0.5) * (-1 + 1j)]
-    zeta = jnp.asarray(case.control.parameters["observer_damping"])[:, None]
-    poles = nominal.omega * (-zeta + 1j * jnp.sqrt(1 - zeta**2))
-    last = jnp.exp(-electronics.sensor_highpass * period)
+    parameters = case.control.parameters
+    zeta = jnp.asarray(parameters["observer_damping"])[:, None]
+    modes = nominal.omega * (-zeta + 1j * jnp.sqrt(1 - zeta**2))
+    drained = jnp.exp(-electronics.sensor_highpass * period)
+    slow = jnp.exp(-2 * jnp.pi * jnp.asarray(parameters["bending_hz"]) * period)
+    blocks = _own_blocks(structure, case, nominal)
+    size = blocks.shape[-1]
 
-    def one(f: Array, mode: Array) -> Array:
+    def one(f: Array, mode: Array, slow: Array) -> Array:
         eye = jnp.eye(size)
 
         def pair(x: Array, pole: Array) -> Array:
             z = jnp.exp(pole * period)
             return x @ (f @ f - 2 * jnp.real(z) * f + jnp.real(z * jnp.conj(z)) * eye)
 
-        phi = reduce(pair, [mode, *filters], f - last * eye if size == 5 else eye)
+        phi = f - slow * eye
+        if structure.has_sensor_highpass:
+            phi = phi @ (f - drained * eye)
+        phi = reduce(pair, [mode, *filters], phi)
         return jnp.linalg.solve(f, _ackermann(f.T, eye[2], phi.T))
 
-    own = jnp.arange(size) * count
-    blocks = jnp.stack(
-        [state[:, (own + j)[:, None], (own + j)[None]] for j in range(count)], axis=1
+    return jax.vmap(jax.vmap(one, (0, 0, None)))(blocks, modes, slow)
+
+
+def _own_blocks(structure: Structure, case: Case, nominal: NominalModel) -> Array:
+    """F of each mode, its filters and its slow force alone, (3, C, s, s)."""
+    single = mode_models(structure, case, nominal, nominal.damping_ratio)
+    at = layout(structure, 1, 1)
+    own = jnp.array([at[x].start for x in ("q", "rate", "z", "z_rate", "s") if x in at])
+    above = jnp.concatenate(
+        [single.state[:, :, own[:, None], own], single.drive[:, :, own]], axis=3
     )
-    return jax.vmap(jax.vmap(one))(blocks, poles)
+    kept = jnp.broadcast_to(force_decay(case)[:, None, None, None], (*above.shape[:2], 1, 1))
+    below = jnp.pad(kept, ((0, 0), (0, 0), (0, 0), (own.size, 0)))
+    return jnp.concatenate([above, below], axis=2)
 
 
 def regulator(structure: Structure, case: Case, nominal: NominalModel, model: LinkModel) -> Array:
@@ -123,17 +138,17 @@ def _cosine(square: Array) -> Array:
 def design(structure: Structure, case: Case, nominal: NominalModel) -> StateSpace:
     """Observers of all modes, and a regulator of what they predict."""
     model = link_model(structure, case, nominal)
+    wide = bent(case, model)
     n = model.state.shape[1]
-    root = jnp.sqrt(nominal.modal_mass)
-    own = corrections(structure, case, nominal, model.state)  # (3, C, s)
-    seen = (nominal.omega * root)[
-        ..., None
-    ] * nominal.observer  # residual in z~ per volt, (3, C, K)
-    parts = [own[:, :, k, None] * seen for k in range(own.shape[2])]
-    correct = jnp.concatenate(parts, axis=1)  # (3, s C, K)
+    residual = (nominal.omega * jnp.sqrt(nominal.modal_mass))[..., None] * nominal.observer
+    own = corrections(structure, case, nominal)  # (3, C, s)
+    # residual in z~ per volt, (3, C, K)
+    parts = [own[:, :, k, None] * residual for k in range(own.shape[2])]
+    correct = jnp.concatenate(parts[:-1], axis=1)  # (3, (s - 1) C, K)
     correct = jnp.pad(correct, ((0, 0), (0, n - correct.shape[1]), (0, 0)))
-    gain = regulator(structure, case, nominal, model)
-    return compensated(structure, case, model, gain, correct)
+    correct = jnp.concatenate([correct, parts[-1]], axis=1)
+    gain = wide.relative(regulator(structure, case, nominal, model))
+    return compensated(structure, case, wide.model, gain, correct)
 
 
 OBSERVER = Law(
@@ -146,6 +161,7 @@ OBSERVER = Law(
         Parameter(
             "observer_damping", 0.3, "1", "damping ratio of the observer's modes", 0.01, 0.99
         ),
+        BENDING,
         DAMPING,
     ),
 )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 import scipy
 
@@ -76,20 +77,26 @@ def modal_blocks(system: StateSpace) -> ModalBlocks:
 
 def _to_pairs(system: StateSpace, group: int) -> StateSpace:
     """One group, its blocks of two states."""
-    one = StateSpace(*(part[group : group + 1] for part in system))
+    one = jax.tree.map(lambda part: part[group : group + 1], system)
     if system.state.shape[2] == 2:
         return one
     a, b, c, d = dense(one)
+    size, tell = len(d), one.anti_windup
+    if tell is not None:
+        b = np.hstack([b, tell.reshape(len(a), size)])
     try:
         form = modal_form(a, b, c)
     except IllConditionedError as error:
         raise StudyError(f"the controller has {error}") from None
-    return StateSpace(form.state[None], form.enter[None], form.leave[None], d[None])
+    enter = form.enter[None, ..., :size]
+    tell = None if tell is None else form.enter[None, ..., size:]
+    return StateSpace(form.state[None], enter, form.leave[None], d[None], tell)
 
 
 def _stack_groups(parts: list[StateSpace]) -> StateSpace:
     """Groups side by side, padded with blocks that stay 0."""
     most = max((part.state.shape[1] for part in parts), default=0)
+    tell = [part.anti_windup for part in parts if part.anti_windup is not None]
 
     def padded(x: np.ndarray, axis: int) -> np.ndarray:
         more = most - x.shape[axis]
@@ -100,6 +107,7 @@ def _stack_groups(parts: list[StateSpace]) -> StateSpace:
         enter=np.concatenate([padded(x.enter, 1) for x in parts]),
         leave=np.concatenate([padded(x.leave, 2) for x in parts]),
         direct=np.concatenate([x.direct for x in parts]),
+        anti_windup=np.concatenate([padded(x, 1) for x in tell]) if tell else None,
     )
 
 
@@ -114,7 +122,7 @@ def unfold_blocks(blocks: ModalBlocks, like: Controller) -> Controller:
         whole[blocks.link] = part
         return whole
 
-    return like._replace(feedback=StateSpace(*map(spread, system)))
+    return like._replace(feedback=jax.tree.map(spread, system))
 
 
 class ImpulseResponses(NamedTuple):
@@ -133,7 +141,7 @@ def responses(system: StateSpace, group: int, n: int) -> ImpulseResponses:
         group: which group.
         n: samples.
     """
-    state, enter, leave, direct = (part[group] for part in system)
+    state, enter, leave, direct = (part[group] for part in system[:4])
     count, size = len(state), len(direct)
     impulse = np.zeros(n)
     impulse[0] = 1.0

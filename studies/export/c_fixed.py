@@ -54,12 +54,14 @@ def _constants(
     channels: ActiveChannels | ModalBlocks, fixed: FixedPoint | FixedBlocks
 ) -> dict[str, Any]:
     if isinstance(fixed, FixedBlocks):
-        advance, leave = fixed.advance, fixed.leave
+        advance, leave, windup = fixed.advance, fixed.leave, fixed.anti_windup
         return {
             "advance": advance.integers.reshape(-1, advance.integers.shape[-1]),
             "advance_shift": advance.shift.ravel(),
             "leave": leave.integers.reshape(-1, leave.integers.shape[-1]),
             "leave_shift": leave.shift.ravel(),
+            "windup": _rows(windup, leave.shift.shape[1]),
+            "windup_shift": None if windup is None else windup.shift.ravel(),
         }
     assert isinstance(channels, ActiveChannels)
     first, memory, numerator = fixed.high_pass, fixed.memory, fixed.numerator.integers

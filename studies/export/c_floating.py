@@ -51,4 +51,5 @@ def _constants(channels: ActiveChannels | ModalBlocks) -> dict[str, Any]:
         "enter_rows": system.enter.reshape(-1, size),
         "leave_rows": system.leave.reshape(len(system.leave) * size, -1),
         "direct_rows": system.direct.reshape(-1, size),
+        "windup_rows": None if system.anti_windup is None else system.anti_windup.reshape(-1, size),
     }

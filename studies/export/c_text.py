@@ -76,6 +76,7 @@ def _channel_values(channels: ActiveChannels | ModalBlocks) -> dict[str, Any]:
         return {
             "blocks": None,
             "channels": channels,
+            "has_anti_windup": False,
             "is_rival": channels.is_rival.astype(int),
         }
     groups, n, _, size = channels.system.enter.shape
@@ -83,6 +84,7 @@ def _channel_values(channels: ActiveChannels | ModalBlocks) -> dict[str, Any]:
     return {
         "blocks": channels,
         "channels": None,
+        "has_anti_windup": channels.system.anti_windup is not None,
         "order": 2 * n,
         "n_ports": size,
         "port_names": ports,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from studies.engine.blocks import ModalBlocks
@@ -59,8 +60,7 @@ def cost_of(exported: FixedController, fixed: FixedPoint | FixedBlocks) -> Cost:
 def products_of(channels: ActiveChannels | ModalBlocks) -> int:
     """Multiplications of filter, synthesizer and sections in a sample; of blocks, also by 0."""
     if isinstance(channels, ModalBlocks):
-        system = channels.system
-        return int(sum(x.size for x in (system.state, system.enter, system.leave, system.direct)))
+        return int(sum(np.size(x) for x in jax.tree.leaves(channels.system)))
     n, k = channels.filter.shape
     switched = 0 if channels.energy is None else 10
     return n * (2 * k + 1 + 2 + 3 + 3 + bool(np.any(channels.direct)) + switched)
@@ -75,4 +75,5 @@ def _of_channels(fixed: FixedPoint) -> tuple[int, int]:
 def _of_blocks(fixed: FixedBlocks) -> tuple[int, int]:
     """The same of all blocks."""
     states = fixed.state.bits.size
-    return states + fixed.leave.shift.size, 2 * states
+    roundings = states + fixed.leave.shift.size
+    return roundings + (0 if fixed.anti_windup is None else states), 2 * states

@@ -102,6 +102,7 @@ SYSTEMS = (
     "input_matrix @ sensor, where state_matrix stands for its blocks on the diagonal",
     "command = wanted, limited to +-voltage_limit; it goes out at the next sample",
 )
+TOLD = "then state = state + anti_windup @ (command - wanted)"
 _LINK, _PATCH = "link", "patch"
 
 
@@ -138,7 +139,8 @@ def document(exported: FixedController, case_id: str = "") -> Document:
 
 def _steps(feedback: Feedback) -> list[str]:
     if isinstance(feedback, StateSpace):
-        return [SYSTEMS[0], *STEPS[1:3], *SYSTEMS[1:], *STEPS[9:]]
+        told = [] if feedback.anti_windup is None else [TOLD]
+        return [SYSTEMS[0], *STEPS[1:3], *SYSTEMS[1:], *told, *STEPS[9:]]
     return STEPS if feedback.rival_omega is None else [*STEPS[:8], RIVALS, *STEPS[8:]]
 
 
@@ -192,6 +194,18 @@ def _of_system(system: StateSpace) -> dict[str, Quantity]:
             system.leave, "1", "C, volts per state", ["system", "actuator", "block", "from"]
         ),
         "direct": _one(system.direct, "1", "D", ["system", "actuator", "sensor"]),
+        **(
+            {}
+            if system.anti_windup is None
+            else {
+                "anti_windup": _one(
+                    system.anti_windup,
+                    "1",
+                    "E, state per volt that a limit adds to a command",
+                    [*block, "to", "actuator"],
+                )
+            }
+        ),
     }
 
 
@@ -286,6 +300,7 @@ def _system_of(number: dict[str, np.ndarray]) -> StateSpace:
         enter=number["input_matrix"],
         leave=number["output_matrix"],
         direct=number["direct"],
+        anti_windup=number.get("anti_windup"),
     )
 
 

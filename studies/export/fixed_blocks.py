@@ -8,13 +8,16 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
-from jaxmodel.state_space import StateSpace
+from jaxmodel.state_space import StateSpace, dense
 from studies.engine.blocks import ImpulseResponses, ModalBlocks, responses
 from studies.engine.controller import FixedController
+from studies.errors import StudyError
 from studies.export.fixed import (
     FORGOTTEN,
+    LONGEST_MEMORY,
     ErrorBound,
     Format,
     IntegerRow,
@@ -39,6 +42,8 @@ class FixedBlocks(NamedTuple):
     advance: IntegerRow  # two states of the block, then the sensors, (G, N, 2, 2 + M)
     leave: IntegerRow  # all states of the group, then the sensors, (G, M, 2 N + M)
     error: ErrorBound
+    # states from what the limits change, in DAC codes, (G, N, 2, M); None: they are not told
+    anti_windup: IntegerRow | None = None
 
     @property
     def formats(self) -> list[tuple[str, Format, str]]:
@@ -67,7 +72,12 @@ def design_blocks(exported: FixedController, signals: BlockSignals, dac_bits: in
     groups, n, _, size = system.enter.shape
     volts = blocks.of_groups(sensor_bound(exported.controller))  # (G, M)
     each = [responses(system, g, memory) for g in range(groups)]
-    bound = np.stack([np.abs(x.state).sum(axis=3) @ v for x, v in zip(each, volts, strict=True)])
+    if system.anti_windup is None:
+        bound = [np.abs(x.state).sum(axis=3) @ v for x, v in zip(each, volts, strict=True)]
+    else:
+        limit = float(exported.controller.voltage_limit)
+        bound = [_bound_observer(blocks, g, volts[g], limit) for g in range(groups)]
+    bound = np.stack(bound)
     state = find_format(signals.state, np.maximum(bound, np.finfo(float).tiny))
     step, sensor = state.step, wires.sensor_step
     within = system.state * step[:, :, None, :] / step[..., None]
@@ -81,6 +91,9 @@ def design_blocks(exported: FixedController, signals: BlockSignals, dac_bits: in
         advance=find_row(np.concatenate([within, entering], axis=3), "states"),
         leave=find_row(np.concatenate([leaving, direct], axis=2), "outputs"),
         error=ErrorBound(*np.zeros((3, 3, exported.n_patches))),
+        anti_windup=None
+        if system.anti_windup is None
+        else find_row(system.anti_windup * wires.dac_step / step[..., None], "anti-windup"),
     )
     error = _error_bound(exported, blocks, fixed, each, memory)
     check_error(exported, error, wires.dac_step)
@@ -99,8 +112,41 @@ def rounded_blocks(fixed: FixedBlocks, like: ModalBlocks) -> ModalBlocks:
             enter=advance[..., 2:] * step[..., None] / wires.sensor_step,
             leave=leave[..., : 2 * n].reshape(groups, size, n, 2) * wires.dac_step / step[:, None],
             direct=leave[..., 2 * n :] * wires.dac_step / wires.sensor_step,
+            anti_windup=None
+            if fixed.anti_windup is None
+            else fixed.anti_windup.values * step[..., None] / wires.dac_step,
         )
     )
+
+
+def _bound_observer(
+    blocks: ModalBlocks, group: int, sensor: np.ndarray, limit: float
+) -> np.ndarray:
+    """Largest states that any sensor voltages and limited commands can produce, (N, 2).
+
+    With v = u + (v - u): x_(k+1) = (A - E C) x_k + (B - E D) y_k + E v_k, in which |v| is at most
+    the limit, so that the sums of impulse responses bound every sequence.
+
+    Raises:
+        StudyError: that matrix is not stable, or forgets too slowly.
+    """
+    one = jax.tree.map(lambda part: part[group : group + 1], blocks.system)
+    a, b, c, d = dense(one)
+    tell = one.anti_windup.reshape(b.shape)
+    a, b = a - tell @ c, b - tell @ d
+    radius = float(np.abs(np.linalg.eigvals(a)).max(initial=0.0))
+    if not radius < 1 + np.log(FORGOTTEN) / LONGEST_MEMORY:
+        raise StudyError(
+            f"fixed point: with commands at their limits the controller has a pole of modulus "
+            f"{radius:.12g}; allowed: below 1, or its states have no bound (or --target c)"
+        )
+    power = np.hstack([b * sensor, tell * limit])
+    total = np.abs(power)
+    while np.any(np.abs(power) > FORGOTTEN * np.maximum(total, np.finfo(float).tiny)):
+        power = a @ power
+        total = total + np.abs(power)
+    bound: np.ndarray = total.sum(axis=1).reshape(one.state.shape[1:3])
+    return bound
 
 
 def _error_bound(

@@ -15,6 +15,7 @@ class BlockSignals(NamedTuple):
     """Signals of a controller in blocks over time; leading axes (T, ...)."""
 
     state: np.ndarray  # [V], (..., G, N, 2)
+    demand: np.ndarray  # without limit [V], (..., G, M)
     command: np.ndarray  # [V], (..., 3, K)
 
 
@@ -70,8 +71,12 @@ def _by_blocks(
         demand = demand + np.einsum("gpm,...gm->...gp", system.direct, volts)
         state = np.einsum("gnbc,...gnc->...gnb", system.state, state)
         state = state + np.einsum("gnbm,...gm->...gnb", system.enter, volts)
-        command = blocks.of_patches(np.clip(demand, -limit, limit), codes.shape[-1])
-        rows.append((state, command))
+        applied = np.clip(demand, -limit, limit)
+        if system.anti_windup is not None:
+            change = applied - demand
+            state = state + np.einsum("gnbm,...gm->...gnb", system.anti_windup, change)
+        command = blocks.of_patches(applied, codes.shape[-1])
+        rows.append((state, demand, command))
     return BlockSignals(*map(np.stack, zip(*rows, strict=True)))
 
 

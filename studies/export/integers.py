@@ -118,7 +118,12 @@ class _BlockMemory:
         counts = _rounded_sums(fixed.leave, np.concatenate([flat, volts], -1)[..., None, :])
         entering = np.broadcast_to(volts[..., None, :], (*state.shape[:-1], volts.shape[-1]))
         read = np.concatenate([state, entering], -1)[..., None, :]
-        self._state = _clip(_rounded_sums(fixed.advance, read), cut, STATES)
+        after = _rounded_sums(fixed.advance, read)
+        if fixed.anti_windup is not None:
+            most = fixed.wires.dac_rest - 1
+            change = _clip(np.clip(counts, -most, most) - counts, cut, SENSORS)
+            after = after + _rounded_sums(fixed.anti_windup, change[..., None, None, :])
+        self._state = _clip(after, cut, STATES)
         return fixed.blocks.of_patches(counts, sensor.shape[-1])
 
     def reset(self, is_faulty: np.ndarray) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxmodel.motion import sample_path, shape_path
 from jaxmodel.shaper import Taps
+from studies.engine.blocks import ModalBlocks
 from studies.engine.controller import FixedController, arrange
 from studies.engine.programs import kept_jit
 from studies.export.c_text import Source
@@ -17,6 +18,7 @@ from studies.export.compiler import Code, compiled
 from studies.export.document import Document, controller_of
 from studies.export.fixed import FixedPoint, rail_samples, shaper_row
 from studies.export.fixed_blocks import FixedBlocks
+from studies.export.floating import BlockSignals
 from studies.export.floating import respond as respond_floating
 from studies.export.in_the_loop import LoopRun, replay, run_controller, run_in_the_loop
 from studies.export.integers import Response, shifted
@@ -102,6 +104,7 @@ def verify_document(
             respond_floating(channels, controller, codes).command,
             _replay(exported, codes),
             DOUBLE,
+            _largest_demand(exported, codes),
         )
         for name, codes in {
             "recorded codes": reference.codes,
@@ -129,7 +132,8 @@ def verify_floating(
         for label, codes in sequences.items():
             volts, faults = code.respond(codes * float(exported.controller.adc_step))
             expected = _replay(exported, codes)
-            check = _compare(f"open loop, {label}", volts, expected, DOUBLE)
+            largest = _largest_demand(exported, codes)
+            check = _compare(f"open loop, {label}", volts, expected, DOUBLE, largest)
             checks.append(check._replace(is_met=check.is_met and not faults.any()))
         top = float(exported.controller.adc_top + 3)
         bad = {"beyond the range": top, "NaN": np.nan, "infinite": np.inf}
@@ -265,9 +269,24 @@ def _replay(exported: FixedController, codes: np.ndarray) -> np.ndarray:
     return np.asarray(replay(exported.controller, codes))
 
 
-def _compare(what: str, values: np.ndarray, expected: np.ndarray, allowed: float) -> Check:
-    """Largest difference over the largest value."""
-    size = np.abs(expected).max()
+def _largest_demand(exported: FixedController, codes: np.ndarray) -> float:
+    """Largest voltage that the arithmetic rounds [V]: of the demands if a system is told of limits.
+
+    Demands can be a thousand times the limit, and what limits take away from them enters the state.
+    """
+    blocks = exported.channels
+    if not isinstance(blocks, ModalBlocks) or blocks.system.anti_windup is None:
+        return 0.0
+    signals = respond_floating(blocks, exported.controller, codes)
+    assert isinstance(signals, BlockSignals)
+    return float(np.abs(signals.demand).max())
+
+
+def _compare(
+    what: str, values: np.ndarray, expected: np.ndarray, allowed: float, rounded: float = 0.0
+) -> Check:
+    """Largest difference over the largest value, or over a larger one that was rounded."""
+    size = max(np.abs(expected).max(), rounded)
     difference = float(np.abs(values - expected).max() / (size if size > 0 else 1.0))
     return Check(what, f"{difference:.1e}", f"{allowed:.0e}", difference <= allowed)
 
@@ -397,10 +416,11 @@ def _check_error(
     bound, reason = fixed.error.total, "rounding of the DAC, and inside"
     peak = np.abs(reference.voltage).max()
     limit = fixed.wires.dac_step * (fixed.wires.dac_rest - 1)
-    is_bounded = peak < limit * (1 - 1e-9) or fixed.wires.feedthrough is None
+    is_told = isinstance(fixed, FixedBlocks) and fixed.anti_windup is not None
+    is_bounded = peak < limit * (1 - 1e-9) or not (is_told or fixed.wires.feedthrough is not None)
     if not is_bounded or not np.all(np.isfinite(bound)):
         bound = np.full_like(bound, 0.01 * peak + 2 * fixed.wires.dac_step)
-        reason = "1 % and two steps of the DAC: its rounding comes back by feed-through"
+        reason = "1 % and two steps of the DAC: what is rounded at a limit comes back"
     worst = np.unravel_index(np.argmax(difference / bound), bound.shape)
     return Check(
         "open loop against JAX, recorded codes",

@@ -19,7 +19,7 @@ from studies.space.axes import ALIASES, READY_MADE, Range, parse_range
 from studies.study.cases import case_of
 from studies.study.numbers import Numbers, position, put
 from studies.study.paths import checked_value, free_fields, known_field, overlaps, parse_entry
-from studies.study.spec import Study
+from studies.study.spec import OWN_FIELDS, Study
 
 #: Puts values (p,) of free parameters, in the study's units, among the numbers of one case; nan
 #: leaves the case's value. Pass the same object, or an equal one, to avoid recompiling.
@@ -131,6 +131,7 @@ def plain_numbers(
     path: str,
     roles: Sequence[str],
     others: Sequence[str] = (),
+    laws: Sequence[str] = (),
 ) -> tuple[list[Free], Place]:
     """The numbers of one free field, and what puts their values among those of a study.
 
@@ -141,6 +142,7 @@ def plain_numbers(
         path: where it is written, for messages.
         roles: of the fields that can be free, besides the law's own.
         others: further names that can be, for messages.
+        laws: control laws whose parameters can be free; (): that of the study.
 
     Raises:
         StudyError: unknown name, bad bounds, a start outside them.
@@ -153,7 +155,7 @@ def plain_numbers(
         raise StudyError(f"{path}: cannot be free; {hint}")
     value = known_field(name, study, path)  # names the nearest field if there is none
     assert entry is not None
-    allowed = free_fields(study, *roles)
+    allowed = free_fields(laws or (study.control.law,), *roles)
     if entry.field not in allowed:
         hint = nearest(entry.field, allowed)
         raise StudyError(
@@ -211,6 +213,8 @@ def _entries(value: Any, indices: tuple[int, ...] = ()) -> list[tuple[tuple[int,
 
 def _set(positions: tuple[Any, ...], numbers: Numbers, values: Array) -> Numbers:
     for k, at in enumerate(positions):
+        if at[0].startswith(f"{OWN_FIELDS}.") and at[0] not in numbers:
+            continue  # of a law that this program does not have
         numbers = put(numbers, at, values[k], keeps_missing=True)
     return numbers
 

@@ -112,8 +112,8 @@ def field_choices(field: str) -> tuple[str, ...]:
     return choices_of(fields[leaf].annotation, fields[leaf].metadata) if leaf in fields else ()
 
 
-def free_fields(study: Study, *roles: str) -> tuple[str, ...]:
-    """Fields that can be free, and those of the study's law.
+def free_fields(laws: Iterable[str], *roles: str) -> tuple[str, ...]:
+    """Fields that can be free, and those of some laws.
 
     roles: `DESIGN`, `MACHINE`.
     """
@@ -123,8 +123,8 @@ def free_fields(study: Study, *roles: str) -> tuple[str, ...]:
         for leaf, info in getattr(outer.annotation, "model_fields", {}).items()
         if isinstance(info.json_schema_extra, dict) and info.json_schema_extra.get("free") in roles
     ]
-    law = LAWS[study.control.law]
-    return (*names, *(f"{OWN_FIELDS}.{law.name}.{x.name}" for x in law.parameters))
+    own = (f"{OWN_FIELDS}.{name}.{x.name}" for name in laws for x in LAWS[name].parameters)
+    return (*names, *own)
 
 
 def as_list(field: str, value: Any) -> Any:

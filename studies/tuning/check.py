@@ -147,26 +147,40 @@ class PlainRuns:
         return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
 
 
-def judge(spec: TuneSpec, designs: list[Study], runs: PlainRuns) -> list[JudgedDesign]:
+class LawRuns:
+    """`PlainRuns` of each control law, made when they are needed."""
+
+    def __init__(self, spec: TuneSpec, count: int) -> None:
+        """
+        Args:
+            spec: of the tuning.
+            count: of a batch, about.
+        """
+        self._spec, self._count = spec, count
+        self._programs: dict[str, PlainRuns] = {}
+
+    def of(self, law: str) -> PlainRuns:
+        """Those of one law."""
+        if law not in self._programs:
+            self._programs[law] = PlainRuns(shown_structure(self._spec, law), self._count)
+        return self._programs[law]
+
+
+def judge(spec: TuneSpec, designs: list[Study], runs: LawRuns) -> list[JudgedDesign]:
     """Run designs on scenarios not used in the tuning, and as in their own files.
 
     Args:
         spec: of the tuning.
-        designs: studies that differ from the tuning's own only in numbers; its own comes first.
-        runs: of `shown_structure`.
+        designs: studies that differ from the tuning's own only in numbers and control law; its own
+            comes first.
+        runs: of the tuning.
     """
-    columns, goal, structure = fresh_columns(spec), objective_of(spec), runs.structure
+    columns, goal = fresh_columns(spec), objective_of(spec)
     count = len(columns["run.seed"])
-    parts = []
-    for study in designs:
-        fresh, file = (build_cases(study, x, structure) for x in (columns, {}))
-        parts += [_repeat(fresh, count), _repeat(file, 1)]
-    rows = len(designs) * (count + 1)
-    result = runs.run(jax.tree.map(lambda *x: np.concatenate(x), *parts), rows)
-    by_design = jax.tree.map(lambda x: x.reshape(len(designs), count + 1, *x.shape[1:]), result)
+    by_design = _run_designs(designs, columns, runs)
     metrics = by_design.metrics
     baseline = jax.tree.map(lambda x: x[0], metrics)
-    end = structure.n_steps / spec.study.electronics.sample_rate_hz
+    end = runs.of(spec.law()).structure.n_steps / spec.study.electronics.sample_rate_hz
     judged = []
     for k, study in enumerate(designs):
         of_design = jax.tree.map(lambda x, k=k: x[k], metrics)
@@ -191,6 +205,26 @@ def judge(spec: TuneSpec, designs: list[Study], runs: PlainRuns) -> list[JudgedD
     return [_with_poles(study, design) for study, design in zip(designs, judged, strict=True)]
 
 
+def _run_designs(designs: list[Study], columns: dict[str, np.ndarray], runs: LawRuns) -> Result:
+    """Runs of designs in scenarios, then as in their own files; (designs, scenarios + 1, ...)."""
+    laws, count = [study.control.law for study in designs], len(columns["run.seed"])
+    order, results = [], []
+    for law in dict.fromkeys(laws):
+        program, chosen = runs.of(law), [k for k, x in enumerate(laws) if x == law]
+        parts = []
+        for k in chosen:
+            fresh, file = (build_cases(designs[k], x, program.structure) for x in (columns, {}))
+            parts += [_repeat(fresh, count), _repeat(file, 1)]
+        rows = len(chosen) * (count + 1)
+        result = program.run(jax.tree.map(lambda *x: np.concatenate(x), *parts), rows)
+        shape = len(chosen), count + 1
+        results.append(jax.tree.map(lambda x, n=shape: x.reshape(*n, *x.shape[1:]), result))
+        order += chosen
+    back = np.argsort(order)
+    whole: Result = jax.tree.map(lambda *x: np.concatenate(x)[back], *results)
+    return whole
+
+
 def _repeat(cases: Case, count: int) -> Case:
     return jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape[1:])), cases)
 
@@ -210,9 +244,9 @@ def _with_poles(study: Study, judged: JudgedDesign) -> JudgedDesign:
     return judged._replace(poles=pole_report(structure, case, loop))
 
 
-def shown_structure(spec: TuneSpec) -> Structure:
-    """Program of the runs shown in a report."""
-    return tuned_structure(spec)._replace(metrics=objective_of(spec).shown_metrics)
+def shown_structure(spec: TuneSpec, law: str) -> Structure:
+    """Program of a law's runs shown in a report."""
+    return tuned_structure(spec, law)._replace(metrics=objective_of(spec).shown_metrics)
 
 
 def search(spec: TuneSpec, screen: Any) -> RandomSearch:
@@ -230,8 +264,11 @@ def search(spec: TuneSpec, screen: Any) -> RandomSearch:
     points = np.where(family.is_free, points[:n], own_place)
     values = np.where(family.is_free, spec.free.values(points), np.nan)
     columns = scenario_columns(spec, spec.tune.scenarios.count, spec.tune.scenarios.seed)
-    count, structure = len(columns["run.seed"]), shown_structure(spec)
-    lanes = lane_columns(spec, columns, [None, *[family] * CHUNK])
+    law = spec.law(family)
+    count, structure = len(columns["run.seed"]), shown_structure(spec, law)
+    is_own = law == spec.law()
+    measure = None if is_own else _baseline_metrics(spec, columns)
+    lanes = lane_columns(spec, columns, [None if is_own else family, *[family] * CHUNK])
     numbers = study_numbers(spec.study, structure, lanes)
     layout = even_layout(count * (1 + CHUNK))
     rows = layout.filled(count * (1 + CHUNK))
@@ -253,6 +290,7 @@ def search(spec: TuneSpec, screen: Any) -> RandomSearch:
         spent += time.perf_counter() - started
         metrics = jax.tree.map(split, result.metrics)
         baseline, others = (jax.tree.map(lambda x, k=k: x[k], metrics) for k in (0, slice(1, None)))
+        baseline = baseline if measure is None else measure
         allowed = allowed_limits(goal, family, baseline_limits(goal, baseline))
         judgement = judge_designs(goal, others, baseline, allowed)
         batches.append((*map(np.asarray, judgement), first_residual(goal, metrics)[1:]))
@@ -273,3 +311,10 @@ def search(spec: TuneSpec, screen: Any) -> RandomSearch:
         run_time=run_time,
         runs=n * count,
     )
+
+
+def _baseline_metrics(spec: TuneSpec, columns: dict[str, np.ndarray]) -> Any:
+    """Metrics of the baseline in scenarios, by the program of its own law."""
+    count, structure = len(columns["run.seed"]), shown_structure(spec, spec.law())
+    cases = build_cases(spec.study, lane_columns(spec, columns, [None]), structure)
+    return PlainRuns(structure, count).run(cases, count).metrics

@@ -49,7 +49,7 @@ class Evaluation(NamedTuple):
 
 
 class Evaluator:
-    """Evaluates batches of one size and order of families."""
+    """Evaluates batches of one size and order of families, the designs of each law by a program."""
 
     def __init__(self, spec: TuneSpec, families: list[Family]) -> None:
         """
@@ -63,22 +63,14 @@ class Evaluator:
         self.spec, self.families = spec, families
         self.goal, self.linear = objective_of(spec), LinearFidelity(spec, families)
         self.is_free = np.stack([family.is_free for family in families])
-        self._structure = tuned_structure(spec)._replace(is_smooth=True, has_noise=True)
-        columns = scenario_columns(spec, spec.tune.scenarios.count, spec.tune.scenarios.seed)
-        self.scenarios = len(columns["run.seed"])
-        self.lanes = self.scenarios * (1 + len(families))  # runs of a batch
-        self._layout = _layout(self.lanes)
-        rows = self._layout.filled(self.lanes)
-        whole = lane_columns(spec, columns, [None, *families])
-        study = spec.study.change(run__smooth=True)
-        padded = {name: column[rows] for name, column in whole.items()}
-        numbers = study_numbers(study, self._structure, padded)
-        self._numbers = in_working_precision(numbers)
-        self._rows = rows // self.scenarios  # design of every lane, the baseline first
+        laws = [spec.law(family) for family in families]
+        # the baseline's law first: all designs are measured against it
+        self._programs = [
+            _LawRuns(spec, law, families, np.flatnonzero([x == law for x in laws]))
+            for law in dict.fromkeys([spec.law(), *laws])
+        ]
+        self.lanes = sum(program.lanes for program in self._programs)  # runs of a batch
         self.run_time = float("nan")  # time per run of the last batch [s]
-        self._executor = Executor(
-            self._structure, self._layout, place=spec.free.build(self._structure)
-        )
 
     def evaluate(self, values: np.ndarray, needs_gradient: np.ndarray | bool = True) -> Evaluation:
         """Objective and limits of designs.
@@ -89,38 +81,138 @@ class Evaluator:
             needs_gradient: designs that need derivatives; others can have any, (designs,).
         """
         values = np.where(self.is_free, values, np.nan)
-        unchanged = np.full((1, values.shape[1]), np.nan)
-        is_compiled, started = self._executor.compile_time > 0, time.perf_counter()
-        whole = np.concatenate([unchanged, values])[self._rows]
+        is_compiled = all(program.is_compiled for program in self._programs)
+        started = time.perf_counter()
         is_differentiated = (np.isfinite(values) & np.reshape(needs_gradient, (-1, 1))).any(axis=1)
+        baseline, parts, order = None, [], []
+        for program in self._programs:
+            rows = program.rows
+            runs = program.run(values[rows])
+            if baseline is None:
+                baseline = jax.tree.map(lambda x: x[0], runs.metrics)
+                self._check_baseline(runs.status[0], baseline)
+            if rows.size:
+                parts.append(program.judge(self.goal, runs, baseline, is_differentiated[rows]))
+                order.append(rows)
+        back = np.argsort(np.concatenate(order))
+        whole = _Judged(*(np.concatenate(x)[back] for x in zip(*parts, strict=True)))
+        if is_compiled:
+            self.run_time = (time.perf_counter() - started) / self.lanes
+        beyond, change = self.linear.limits(values)
+        limit_slope = np.concatenate([whole.slopes[:, 1:], change], axis=1)
+        return Evaluation(
+            objective=whole.objective,
+            slope=np.where(self.is_free, whole.slopes[:, 0], 0.0),
+            limits=np.concatenate([whole.limits, beyond], axis=1),
+            limit_slope=np.where(self.is_free[:, None], limit_slope, 0.0),
+            peaks=np.concatenate([whole.peaks, np.full(beyond.shape, np.nan)], axis=1),
+            status=whole.status,
+            residual=whole.residual,
+        )
+
+    def _check_baseline(self, codes: np.ndarray, metrics: Any) -> None:
+        is_bad = ~np.isin(codes, status.FINISHED)
+        if is_bad.any():
+            k = int(np.argmax(is_bad))
+            raise StudyError(
+                f"tune: the baseline does not finish a run in scenario {k}: "
+                f"{status.REASONS[int(codes[k])]}; every design is measured against it"
+            )
+        for name, _ in self.goal.terms:
+            if (np.asarray(size(self.goal, metrics, name)) == 0).any():
+                raise StudyError(
+                    f"tune.objective: {name} is 0 in a run of the baseline, so nothing can be "
+                    "measured against it; limit it instead"
+                )
+        relative = {
+            name for family in self.families for name, x in family.limits.items() if x == BASELINE
+        }
+        for name in relative & set(self.goal.limits):
+            if (np.asarray(largest(self.goal, metrics, name)) <= 0).any():
+                raise StudyError(
+                    f"tune.limits.{name} = {BASELINE!r}: the baseline has 0 in a run, which "
+                    "leaves no room; give a number"
+                )
+
+
+class _Runs(NamedTuple):
+    """Runs of a program, the baseline first."""
+
+    runs: Differentiated
+    metrics: Any  # leaves (1 + designs, scenarios, ...)
+    status: np.ndarray  # (1 + designs, scenarios)
+
+
+class _Judged(NamedTuple):
+    """Designs of a program, judged by their runs; NumPy arrays, designs first."""
+
+    objective: np.ndarray
+    limits: np.ndarray
+    peaks: np.ndarray
+    slopes: np.ndarray  # (designs, 1 + m, p)
+    status: np.ndarray
+    residual: np.ndarray
+
+
+class _LawRuns:
+    """The runs of designs of one control law."""
+
+    def __init__(self, spec: TuneSpec, law: str, families: list[Family], rows: np.ndarray) -> None:
+        """
+        Args:
+            spec: of the tuning.
+            law: of these designs.
+            families: of all designs.
+            rows: places of those of this law among them.
+        """
+        self.rows, self._families = rows, [families[k] for k in rows]
+        structure = tuned_structure(spec, law)._replace(is_smooth=True, has_noise=True)
+        columns = scenario_columns(spec, spec.tune.scenarios.count, spec.tune.scenarios.seed)
+        self.scenarios = len(columns["run.seed"])
+        self.lanes = self.scenarios * (1 + len(rows))
+        self._layout = _layout(self.lanes)
+        lanes = self._layout.filled(self.lanes)
+        # with another law than the baseline's, the first family stands in its place, unused
+        first = None if law == spec.law() else self._families[0]
+        whole = lane_columns(spec, columns, [first, *self._families])
+        study = spec.study.change(run__smooth=True)
+        padded = {name: column[lanes] for name, column in whole.items()}
+        self._numbers = in_working_precision(study_numbers(study, structure, padded))
+        self._rows = lanes // self.scenarios  # design of every lane, the baseline first
+        self._executor = Executor(structure, self._layout, place=spec.free.build(structure))
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether it has run before."""
+        return self._executor.compile_time > 0
+
+    def run(self, values: np.ndarray) -> _Runs:
+        """Run designs, (designs, p) values with nan for what does not move."""
+        whole = np.concatenate([np.full((1, values.shape[1]), np.nan), values])[self._rows]
         runs = self._executor.differentiate(self._numbers, whole)
         shape = (1 + len(values), self.scenarios)
 
         def split(x: Any) -> np.ndarray:
             return np.asarray(x)[: self.lanes].reshape(shape + np.shape(x)[1:])
 
-        metrics = jax.tree.map(split, runs.result.metrics)
-        codes = split(runs.result.status)
-        self._check_baseline(codes[0], jax.tree.map(lambda x: x[0], metrics))
-        baseline = jax.tree.map(lambda x: x[0], metrics)
-        reached = baseline_limits(self.goal, baseline)
-        allowed = [allowed_limits(self.goal, family, reached) for family in self.families]
-        designs = jax.tree.map(lambda x: x[1:], metrics)
-        judged = judge_with_cotangents(self.goal, designs, baseline, np.stack(allowed))
+        return _Runs(runs, jax.tree.map(split, runs.result.metrics), split(runs.result.status))
+
+    def judge(
+        self, goal: Objective, runs: _Runs, baseline: Any, is_differentiated: np.ndarray
+    ) -> _Judged:
+        """Measure designs against the baseline's metrics, with derivatives of some."""
+        reached = baseline_limits(goal, baseline)
+        allowed = [allowed_limits(goal, family, reached) for family in self._families]
+        designs = jax.tree.map(lambda x: x[1:], runs.metrics)
+        judged = judge_with_cotangents(goal, designs, baseline, np.stack(allowed))
         judged = jax.tree.map(np.asarray, judged)
-        slopes = self._slopes(runs, judged.cotangents, is_differentiated)
-        if is_compiled:
-            self.run_time = (time.perf_counter() - started) / self.lanes
-        beyond, change = self.linear.limits(values)
-        limit_slope = np.concatenate([slopes[:, 1:], change], axis=1)
-        return Evaluation(
+        return _Judged(
             objective=judged.objective,
-            slope=np.where(self.is_free, slopes[:, 0], 0.0),
-            limits=np.concatenate([judged.limits, beyond], axis=1),
-            limit_slope=np.where(self.is_free[:, None], limit_slope, 0.0),
-            peaks=np.concatenate([judged.peaks, np.full(beyond.shape, np.nan)], axis=1),
-            status=codes[1:],
-            residual=first_residual(self.goal, metrics)[1:],
+            limits=judged.limits,
+            peaks=judged.peaks,
+            slopes=self._slopes(runs.runs, judged.cotangents, is_differentiated),
+            status=runs.status[1:],
+            residual=first_residual(goal, runs.metrics)[1:],
         )
 
     def _slopes(
@@ -151,30 +243,6 @@ class Evaluator:
         by_design = slopes.reshape(len(slopes), -1, self.scenarios, slopes.shape[-1])
         return np.swapaxes(by_design.sum(axis=2), 0, 1)
 
-    def _check_baseline(self, codes: np.ndarray, metrics: Any) -> None:
-        is_bad = ~np.isin(codes, status.FINISHED)
-        if is_bad.any():
-            k = int(np.argmax(is_bad))
-            raise StudyError(
-                f"tune: the baseline does not finish a run in scenario {k}: "
-                f"{status.REASONS[int(codes[k])]}; every design is measured against it"
-            )
-        for name, _ in self.goal.terms:
-            if (np.asarray(size(self.goal, metrics, name)) == 0).any():
-                raise StudyError(
-                    f"tune.objective: {name} is 0 in a run of the baseline, so nothing can be "
-                    "measured against it; limit it instead"
-                )
-        relative = {
-            name for family in self.families for name, x in family.limits.items() if x == BASELINE
-        }
-        for name in relative & set(self.goal.limits):
-            if (np.asarray(largest(self.goal, metrics, name)) <= 0).any():
-                raise StudyError(
-                    f"tune.limits.{name} = {BASELINE!r}: the baseline has 0 in a run, which "
-                    "leaves no room; give a number"
-                )
-
 
 def _layout(lanes: int) -> Layout:
     """Small blocks: each is differentiated only by what its own designs move."""
@@ -195,13 +263,14 @@ def first_residual(goal: Objective, metrics: Any) -> np.ndarray:
     return np.sqrt(np.mean(metrics.residual_rms[:, 0, list(goal.links)] ** 2, axis=(1, 2)))
 
 
-def tuned_structure(spec: TuneSpec) -> Structure:
-    """Program of all families and scenarios, with everything that can be free."""
-    structures = [check_run(nominal(spec, family))[0] for family in (None, *spec.families)]
-    return build_structure(spec.study)._replace(
+def tuned_structure(spec: TuneSpec, law: str) -> Structure:
+    """Program of all designs of a law in all scenarios, with everything that can be free."""
+    families = [family for family in (None, *spec.families) if spec.law(family) == law]
+    structures = [check_run(nominal(spec, family))[0] for family in families]
+    return build_structure(spec.studies(law)[0])._replace(
         metrics=objective_of(spec).metrics,
         substeps=max(x.substeps for x in structures),
         has_noise=any(x.has_noise for x in structures),
-        has_poles=spec.has_poles,
-        has_position_gain=spec.has_position_gain,
+        has_poles=spec.has_poles(law),
+        has_position_gain=spec.has_position_gain(law),
     )

@@ -41,12 +41,13 @@ def writes(number: Free) -> tuple[str, ...]:
     return ("patches.centers",) if number.key == PLACEMENT else (number.name,)
 
 
-def free_numbers(written: dict[str, Any], study: Study) -> FreeNumbers:
+def free_numbers(written: dict[str, Any], study: Study, laws: Sequence[str] = ()) -> FreeNumbers:
     """Free parameters from what the file says.
 
     Args:
         written: ranges by name, from `[tune.free]`.
         study: the initial design.
+        laws: control laws whose parameters can be free; (): that of the study.
 
     Raises:
         StudyError: nothing free, unknown name, bad bounds, a start outside them.
@@ -59,7 +60,7 @@ def free_numbers(written: dict[str, Any], study: Study) -> FreeNumbers:
         if name == PLACEMENT:
             parts.append(_placement(bounds, study, path))
         else:
-            parts.append(plain_numbers(name, bounds, study, path, (DESIGN,), (PLACEMENT,)))
+            parts.append(plain_numbers(name, bounds, study, path, (DESIGN,), (PLACEMENT,), laws))
     free = join_numbers(parts)
     check_twice(free.numbers, "tune.free")
     _check_decided(free.numbers)

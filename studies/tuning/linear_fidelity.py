@@ -64,17 +64,12 @@ class LinearFidelity:
             families: of each design, in the order given.
         """
         self._spec, self.names, self._links = spec, spec.loop_limits, spec.counted_links
-        baseline = nominal(spec, None)
-        larger = with_margin_modes(baseline)
-        self._structure = build_structure(larger)._replace(
-            n_frequencies=1, has_noise=False, metrics=(), has_position_gain=spec.has_position_gain
-        )
-        self._pose = np.array(baseline.motion.waypoints[0])
-        of_family = {
-            name: one_study(with_margin_modes(nominal(spec, family)), self._structure)
-            for name, family in {family.name: family for family in families}.items()
+        self._pose = np.array(nominal(spec, None).motion.waypoints[0])
+        laws = [spec.law(family) for family in families]
+        self._batches = {
+            law: _batch(spec, families, np.flatnonzero([x == law for x in laws]))
+            for law in dict.fromkeys(laws)
         }
-        self._numbers = as_arrays(stack_numbers([of_family[family.name] for family in families]))
         self._own: DesignFigures | None = None
         self._limits = np.array(
             [[self._limit(family, name) for name in self.names] for family in families]
@@ -99,16 +94,20 @@ class LinearFidelity:
         """
         if not self.names:
             return np.zeros((len(values), 0)), np.zeros((len(values), 0, values.shape[1]))
-        excess, slopes = _limit_slopes(
-            self._plain,
-            self.names,
-            self._spec.free.place,
-            self._numbers,
-            self._pose,
-            self._limits,
-            values,
-        )
-        return np.asarray(excess), np.asarray(slopes)
+        excess = np.zeros(self._limits.shape)
+        slopes = np.zeros((*excess.shape, values.shape[1]))
+        for batch in self._batches.values():
+            excess[batch.rows], slopes[batch.rows] = _limit_slopes(
+                # drop what the matrices do not depend on, to avoid a compilation
+                batch.structure._replace(n_steps=1, substeps=1),
+                self.names,
+                self._spec.free.place,
+                batch.numbers,
+                self._pose,
+                self._limits[batch.rows],
+                values[batch.rows],
+            )
+        return excess, slopes
 
     def screen(self, position: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A quick evaluation of designs of one family.
@@ -121,16 +120,17 @@ class LinearFidelity:
             (largest excess over the limits of the loop, at least that of a stable one, inf where
             none is found, (n,); linear residual vibration [m], (n,)).
         """
-        if self._structure.feedback != "sampled":
+        batch = next(x for x in self._batches.values() if position in x.rows)
+        if batch.structure.feedback != "sampled":
             return np.zeros(len(values)), np.zeros(len(values))
         names = self.names or ("slowest_decay",)
         limits = self._limits[position] if self.names else np.array([STABLE])
         evaluate = partial(
             _screen_batch,
-            self._structure,
+            batch.structure,
             names,
             self._spec.free.place,
-            jax.tree.map(lambda x: x[position], self._numbers),
+            jax.tree.map(lambda x: x[np.searchsorted(batch.rows, position)], batch.numbers),
             self._pose,
             limits,
             self._links,
@@ -147,10 +147,36 @@ class LinearFidelity:
             np.where(np.isfinite(residual), residual, np.inf),
         )
 
-    @property
-    def _plain(self) -> Structure:
-        # drop what the matrices do not depend on, to avoid a compilation
-        return self._structure._replace(n_steps=1, substeps=1)
+
+class _Batch(NamedTuple):
+    """Designs of one control law."""
+
+    rows: np.ndarray  # places among all designs, rising
+    structure: Structure
+    numbers: Numbers
+
+
+def _batch(spec: TuneSpec, families: list[Family], rows: np.ndarray) -> _Batch:
+    chosen = [families[k] for k in rows]
+    law = spec.law(chosen[0])
+    first = None if law == spec.law() else chosen[0]
+    structure = _judged_structure(spec, nominal(spec, first))
+    of_family = {
+        name: one_study(with_margin_modes(nominal(spec, family)), structure)
+        for name, family in {family.name: family for family in chosen}.items()
+    }
+    numbers = as_arrays(stack_numbers([of_family[family.name] for family in chosen]))
+    return _Batch(rows, structure, numbers)
+
+
+def _judged_structure(spec: TuneSpec, study: Study) -> Structure:
+    """Program of the linearised loop of a study's law."""
+    return build_structure(with_margin_modes(study))._replace(
+        n_frequencies=1,
+        has_noise=False,
+        metrics=(),
+        has_position_gain=spec.has_position_gain(study.control.law),
+    )
 
 
 def _excess(
@@ -234,14 +260,11 @@ def loop_figures(spec: TuneSpec, study: Study) -> DesignFigures:
     """Figures of a design's loop on a plant of 12 modes or more.
 
     Args:
-        spec: of the tuning, all designs of which share a program.
+        spec: of the tuning; its designs of one law share a program.
         study: one of them, with sampled feedback.
     """
     larger = with_margin_modes(study)
-    structure, case = build_structure(larger), as_arrays(build_case(larger))
-    structure = structure._replace(
-        n_frequencies=1, has_noise=False, metrics=(), has_position_gain=spec.has_position_gain
-    )
+    structure, case = _judged_structure(spec, study), as_arrays(build_case(larger))
     plain = structure._replace(n_steps=1, substeps=1)
     matrices = _closed_loop(plain, case, np.array(larger.motion.waypoints[0]))
     open_loop, feedback = np.asarray(matrices.open), np.asarray(matrices.feedback)

@@ -56,6 +56,14 @@ static const int32_t LEAVE{{ array(leave, port_names) }};
 
 /* [bit] of each row */
 static const uint16_t LEAVE_SHIFT{{ array(leave_shift) }};
+{% if has_anti_windup %}
+
+/* [state/code] of what the limits change on the system's actuators */
+static const int32_t ANTI_WINDUP{{ array(windup, blocks.names) }};
+
+/* [bit] of each row */
+static const uint16_t ANTI_WINDUP_SHIFT{{ array(windup_shift) }};
+{% endif %}
 {% else %}
 /* [signal/sensor] modal filter pinv(lambda_s Phi_s^t); control.basis, patches */
 static const int32_t FILTER{{ array(fixed.filter.integers, channels.names) }};
@@ -124,6 +132,14 @@ static const uint16_t FEEDTHROUGH_SHIFT{{ array(fixed.wires.feedthrough.shift.ra
 static int32_t limited(int64_t x)
 {
     return x > INT32_MAX ? INT32_MAX : x < INT32_MIN ? INT32_MIN : (int32_t)x;
+}
+
+/* A command within the DAC's codes. */
+static int32_t within(int64_t command)
+{
+    const int64_t most = DAC_REST - 1;
+
+    return (int32_t)(command > most ? most : command < -most ? -most : command);
 }
 
 /* Round to nearest, halves up. Needs a right shift that keeps the sign; all compilers have it. */
@@ -214,6 +230,9 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
     for (s = 0; s < N_SYSTEMS; s++) {
         const int32_t *in = sensed + FIRST[s];
         int32_t *x = state->x + s * ORDER;
+        {% if has_anti_windup %}
+        int32_t change[N_PORTS]; /* of the demands, by the limits [code] */
+        {% endif %}
 
         for (k = 0; k < N_PORTS; k++) {
             const int row = s * N_PORTS + k;
@@ -226,6 +245,9 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
                 sum += (int64_t)LEAVE[row][ORDER + m] * in[m];
             }
             wanted[FIRST[s] + k] = shifted(sum, LEAVE_SHIFT[row]);
+            {% if has_anti_windup %}
+            change[k] = limited(within(wanted[FIRST[s] + k]) - wanted[FIRST[s] + k]);
+            {% endif %}
         }
         for (m = 0; m < ORDER; m += 2) {
             int32_t next[2];
@@ -238,7 +260,19 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
                 for (port = 0; port < N_PORTS; port++) {
                     sum += (int64_t)ADVANCE[row][2 + port] * in[port];
                 }
+                {% if has_anti_windup %}
+                sum = shifted(sum, ADVANCE_SHIFT[row]);
+                {
+                    int64_t told = 0;
+
+                    for (port = 0; port < N_PORTS; port++) {
+                        told += (int64_t)ANTI_WINDUP[row][port] * change[port];
+                    }
+                    next[k] = limited(sum + shifted(told, ANTI_WINDUP_SHIFT[row]));
+                }
+                {% else %}
                 next[k] = limited(shifted(sum, ADVANCE_SHIFT[row]));
+                {% endif %}
             }
             x[m] = next[0];
             x[m + 1] = next[1];
@@ -296,19 +330,14 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
         int32_t command;
 
         {% if blocks %}
-        command = limited(wanted[k]);
+        command = within(wanted[k]);
         {% else %}
         sum = 0;
         for (m = FIRST_MODE[k / {{ NAME }}_N_PATCHES]; m < FIRST_MODE[k / {{ NAME }}_N_PATCHES + 1]; m++) {
             sum += (int64_t)SYNTHESIZER[m][k % {{ NAME }}_N_PATCHES] * force[m];
         }
-        command = limited(shifted(sum, SYNTHESIZER_SHIFT[k]));
+        command = within(shifted(sum, SYNTHESIZER_SHIFT[k]));
         {% endif %}
-        if (command > DAC_REST - 1) {
-            command = DAC_REST - 1;
-        } else if (command < 1 - DAC_REST) {
-            command = 1 - DAC_REST;
-        }
         {% if has_feedthrough %}
         state->command[k] = command;
         {% endif %}

@@ -47,6 +47,11 @@ static const real LEAVE{{ array(leave_rows, port_names) }};
 
 /* [1] of the system's sensors, for each of its actuators */
 static const real DIRECT{{ array(direct_rows, port_names) }};
+{% if has_anti_windup %}
+
+/* [1] of what the limits change on the system's actuators, per volt */
+static const real ANTI_WINDUP{{ array(windup_rows, blocks.names) }};
+{% endif %}
 {% else %}
 /* [{{ "m/V" if is_modal else "1" }}] modal filter pinv(lambda_s Phi_s^t): signal per volt of each
  * sensor of the link; control.basis, patches */
@@ -135,6 +140,11 @@ static int is_pose(const real reference[3])
 
 {{ shared.state("is_pose(reference) ? reference[axis] : 0") }}
 
+static real within(real volts)
+{
+    return volts > LIMIT ? LIMIT : volts < -LIMIT ? -LIMIT : volts;
+}
+
 int {{ name }}_step({{ name }}_state *state, const real sensor[{{ NAME }}_N_CHANNELS],
     real actuator[{{ NAME }}_N_CHANNELS])
 {
@@ -171,6 +181,9 @@ int {{ name }}_step({{ name }}_state *state, const real sensor[{{ NAME }}_N_CHAN
     for (s = 0; s < N_SYSTEMS; s++) {
         const real *in = volt + FIRST[s];
         real *x = state->x + s * ORDER;
+        {% if has_anti_windup %}
+        real change[N_PORTS]; /* of the demands, by the limits [V] */
+        {% endif %}
 
         for (k = 0; k < N_PORTS; k++) {
             real sum = 0;
@@ -182,6 +195,9 @@ int {{ name }}_step({{ name }}_state *state, const real sensor[{{ NAME }}_N_CHAN
                 sum += DIRECT[s * N_PORTS + k][m] * in[m];
             }
             wanted[FIRST[s] + k] = sum;
+            {% if has_anti_windup %}
+            change[k] = within(sum) - sum;
+            {% endif %}
         }
         for (m = 0; m < ORDER; m += 2) {
             real next[2];
@@ -193,6 +209,9 @@ int {{ name }}_step({{ name }}_state *state, const real sensor[{{ NAME }}_N_CHAN
                 next[k] = STATE[row][0] * x[m] + STATE[row][1] * x[m + 1];
                 for (port = 0; port < N_PORTS; port++) {
                     next[k] += ENTER[row][port] * in[port];
+                    {% if has_anti_windup %}
+                    next[k] += ANTI_WINDUP[row][port] * change[port];
+                    {% endif %}
                 }
             }
             x[m] = next[0];
@@ -247,15 +266,10 @@ int {{ name }}_step({{ name }}_state *state, const real sensor[{{ NAME }}_N_CHAN
     {% endif %}
     {% endif %}
     for (k = 0; k < {{ NAME }}_N_CHANNELS; k++) {
-        if (wanted[k] > LIMIT) {
-            wanted[k] = LIMIT;
-        } else if (wanted[k] < -LIMIT) {
-            wanted[k] = -LIMIT;
-        }
+        actuator[k] = within(wanted[k]);
         {% if has_feedthrough %}
-        state->command[k] = wanted[k];
+        state->command[k] = actuator[k];
         {% endif %}
-        actuator[k] = wanted[k];
     }
     return 0;
 }
