@@ -80,17 +80,6 @@ def second_order(corner: Array, zeta: Array, period: Array) -> tuple[Array, Arra
     return warp * warp / lead, a1, a2
 
 
-def highpass_section(electronics: Electronics, like: Array) -> tuple[Array, Array, Array]:
-    """High-pass s/(s + w) at `electronics.highpass` by Tustin, for channels of the shape of `like`.
-
-    Returns:
-        (b0, b1, a1) of (b0 + b1 z^-1)/(1 + a1 z^-1).
-    """
-    half = electronics.highpass * electronics.period / 2
-    gain, pole = 1 / (1 + half), (half - 1) / (1 + half)
-    return gain * jnp.ones_like(like), -gain * jnp.ones_like(like), pole * jnp.ones_like(like)
-
-
 class FilterState(NamedTuple):
     """What the filters remember from sample to sample, (3, C) each."""
 
@@ -142,7 +131,10 @@ def responses(estimator: Estimator, z: Array) -> tuple[Array, Array]:
 def _modal_phase(omega: Array, electronics: Electronics, kappa: Array, zeta: Array) -> Estimator:
     period = electronics.period
     zeta = jnp.broadcast_to(zeta, omega.shape)
-    first = highpass_section(electronics, omega)
+    # high-pass s/(s + w) by Tustin
+    half = electronics.highpass * period / 2
+    gain, pole = 1 / (1 + half), (half - 1) / (1 + half)
+    first = (gain * jnp.ones_like(omega), -gain * jnp.ones_like(omega), pole * jnp.ones_like(omega))
     # its numerator is low (1 + z^-1)^2; that of s LP is c low (1 - z^-2)
     low, a1, a2 = second_order(kappa * omega, zeta, period)
 

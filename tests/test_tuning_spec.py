@@ -487,7 +487,7 @@ def test_designs_of_laws_are_evaluated_in_order():
     rows = [k for k, family in enumerate(spec.moving) if spec.law(family) == "imsc"]
     np.testing.assert_allclose(found.objective[rows], wanted.objective, rtol=1e-9)
     np.testing.assert_allclose(found.slope[rows, 0], wanted.slope[:, 0], rtol=1e-6)
-    push = [k for k, family in enumerate(spec.moving) if spec.law(family) == "ppf"][0]
+    push = next(k for k, x in enumerate(spec.moving) if spec.law(x) == "ppf")
     step = np.array([[0, 1e-4]])
     ahead, back = (
         evaluator.evaluate(spec.free.values(places + sign * step), False) for sign in (1, -1)

@@ -4,9 +4,6 @@ A second-order filter per mode feeds back its output positively, f = +g eta with
 eta'' + 2 zeta_f omega_f eta' + omega_f^2 eta = omega_f^2 q. Where the filter lags by 90 degrees,
 this is a force against q'. In a sampled loop, anti-alias filter, delay and hold lag as well, so the
 filter is tuned for all of them together.
-
-Its static gain would follow the quasi-static bending of the move, so a first-order high-pass at
-`electronics.highpass_hz` stands before it, as before the velocity estimate, and leads the phase.
 """
 
 from __future__ import annotations
@@ -16,7 +13,7 @@ from typing import NamedTuple
 from jaxmodel.case import Case, Electronics, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.electronics import measurement_chain
-from jaxmodel.estimator import Estimator, highpass_section, second_order
+from jaxmodel.estimator import Estimator, second_order
 from jaxmodel.laws.contract import Law, NominalModel, Parameter, modal_feedback, study_gains
 from jaxmodel.laws.imsc import same
 from jaxmodel.lazy import jnp
@@ -37,10 +34,10 @@ class PositionFilter(NamedTuple):
 
 
 def design_position_filter(omega: Array, zeta: Array, electronics: Electronics) -> PositionFilter:
-    """Filters that lag by 90 degrees at omega together with measurement chain and high-pass.
+    """Filters that lag by 90 degrees at omega together with the measurement chain.
 
-    With x = omega/omega_f and a = 90 degrees - lag of the chain + lead of the high-pass,
-    1 - x^2 = 2 zeta_f x cot a; omega_f at most `HIGHEST_RATIO` omega.
+    With x = omega/omega_f and t = tan(90 degrees - lag of the chain), 2 zeta_f x = t (1 - x^2);
+    omega_f at most `HIGHEST_RATIO` omega.
 
     Args:
         omega: assembled frequency of each channel [rad/s], (3, C).
@@ -54,17 +51,14 @@ def design_position_filter(omega: Array, zeta: Array, electronics: Electronics) 
     lag = jnp.arctan2(jnp.sqrt(2.0) * share, 1 - share**2) + 1.5 * omega * period
     lag = lag + jnp.arctan(omega * electronics.amplifier_lag)
     lag = lag - jnp.arctan(electronics.sensor_highpass / omega)
-    lag = lag - jnp.arctan(electronics.highpass / omega)
     least = jnp.arctan(2 * zeta * HIGHEST_RATIO / (HIGHEST_RATIO**2 - 1))
-    angle = jnp.clip(jnp.pi / 2 - lag, least, jnp.pi - least)
-    part = zeta * jnp.cos(angle) / jnp.sin(angle)
-    corner = omega / (jnp.sqrt(part**2 + 1) - part)
+    slope = jnp.tan(jnp.maximum(jnp.pi / 2 - lag, least))
+    corner = omega * slope / (jnp.sqrt(zeta**2 + slope**2) - zeta)
     corner = jnp.minimum(corner, HIGHEST_SHARE * jnp.pi / period)
     low, a1, a2 = second_order(corner, zeta, period)
-    high = highpass_section(electronics, corner)
-    zero = jnp.zeros_like(corner)
+    one, zero = jnp.ones_like(corner), jnp.zeros_like(corner)
     estimator = Estimator(
-        first=high,
+        first=(one, zero, zero),
         denominator=(a1, a2),
         velocity=(zero,) * 3,
         position=(low, 2 * low, low),
@@ -72,7 +66,6 @@ def design_position_filter(omega: Array, zeta: Array, electronics: Electronics) 
     )
     z = jnp.exp(-1j * omega * period)  # z^-1 on the unit circle
     response = low * (1 + z) ** 2 / (1 + a1 * z + a2 * z * z)
-    response = response * (high[0] + high[1] * z) / (1 + high[2] * z)
     whole = measurement_chain(omega, electronics) * response
     return PositionFilter(estimator, corner, -jnp.imag(whole) / omega)
 
