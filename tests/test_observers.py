@@ -7,6 +7,8 @@ import pytest
 from scipy.linalg import expm, solve_discrete_are
 
 from jaxmodel.bases import find_bases
+from jaxmodel.controller import controller_step, rest_controller
+from jaxmodel.laws.bending import BENDING, bent
 from jaxmodel.laws.link_model import link_model
 from jaxmodel.laws.observer import corrections
 from jaxmodel.prepare import design_controller
@@ -49,7 +51,10 @@ def test_riccati_equations_are_solved(seed):
 
 
 def compensator(study, nominal, case, link):
-    """A, B, C, D of one link by SciPy: each mode with its own filter, then hold and delay."""
+    """A, B, C, D of one link by SciPy: each mode with its own filter, then hold and delay.
+
+    Last the slow forces of the move, one for each mode, which the regulator does not know.
+    """
     electronics, parameters = case.electronics, case.control.parameters
     corner, period = float(electronics.antialias), float(electronics.period)
     omega, mass = np.asarray(nominal.omega[link]), np.asarray(nominal.modal_mass[link])
@@ -86,13 +91,24 @@ def compensator(study, nominal, case, link):
     eye = np.eye(patches)
     s = np.concatenate([size, np.ones(patches)])  # SciPy needs numbers of one size
     a1, b1, l1 = state * s / s[:, None], enter / s[:, None], look * s
-    w1 = drive / s[:, None] * parameters["disturbance"][link]
+    w1 = drive / s[:, None] * parameters["disturbance"][link]  # per rms of the new forces
     weight, noise = parameters["voltage_weight"][link], parameters["sensor_noise"][link] ** 2
     x = solve_discrete_are(a1, b1, np.diag(energy * s**2) / weight, eye)
     gain = np.linalg.solve(eye + b1.T @ x @ b1, b1.T @ x @ a1)
-    p = solve_discrete_are(a1.T, l1.T, w1 @ w1.T / noise, eye)
+    corner = 2 * np.pi * parameters["bending_hz"][link] * period
+    # slow forces in units of the others' rms; they change by `corner` of it per sample
+    slow = np.exp(-0.01 * corner) * np.eye(count)
+    bent = np.linalg.solve(np.eye(len(s)) - a1, w1)  # at rest under them
+    a1 = np.block([[a1, w1], [np.zeros((count, len(s))), slow]])
+    b1 = np.vstack([b1, np.zeros((count, patches))])
+    l1 = np.hstack([l1, np.zeros((patches, count))])
+    gain = np.hstack([gain, -gain @ bent])
+    shaken = np.zeros_like(a1)
+    shaken[: len(s), : len(s)] = w1 @ w1.T
+    shaken[len(s) :, len(s) :] = corner**2 * np.eye(count)
+    p = solve_discrete_are(a1.T, l1.T, shaken / noise, eye)
     correct = np.linalg.solve(eye + l1 @ p @ l1.T, l1 @ p).T
-    kept = np.eye(len(s)) - correct @ l1
+    kept = np.eye(len(a1)) - correct @ l1
     after = a1 - b1 @ gain
     return after @ kept, after @ correct, -gain @ kept, -gain @ correct
 
@@ -162,7 +178,7 @@ def test_gradients_equal_differences():
     study = parse_study(SHORT | {"run": {"duration": 0.06, "smooth": True}})
     structure, case = arrays(study)
     structure = structure._replace(metrics=("residual_rms",))
-    names = ("voltage_weight", "disturbance", "sensor_noise")
+    names = ("voltage_weight", "disturbance", "sensor_noise", "bending_hz")
 
     def residual(x):
         given = case.control.parameters
@@ -174,14 +190,14 @@ def test_gradients_equal_differences():
         return squares, squares
 
     run = jax.jit(jax.jacfwd(residual, has_aux=True))  # one program for both
-    slope = run(np.zeros(3))[0]
-    wanted = [float(run(x)[1] - run(-x)[1]) / 2e-3 for x in 1e-3 * np.eye(3)]
+    slope = run(np.zeros(4))[0]
+    wanted = [float(run(x)[1] - run(-x)[1]) / 2e-3 for x in 1e-3 * np.eye(4)]
     np.testing.assert_allclose(slope, wanted, rtol=1e-4)
 
 
 @pytest.mark.parametrize("highpass", [0.0, 3.0])
 def test_observers_have_the_poles_that_were_placed(highpass):
-    """Of every mode: the given damping at its frequency; those of its filters stay."""
+    """Of every mode: the given damping at its frequency, and its bending; its filters' stay."""
     control = {"law": "observer", "modes": 2, "laws": {"observer": {"observer_damping": 0.4}}}
     electronics = {"sensor_highpass_hz": highpass}
     study = parse_study(SHORT | {"control": control, "electronics": electronics})
@@ -189,20 +205,21 @@ def test_observers_have_the_poles_that_were_placed(highpass):
 
     def both(case):
         nominal = nominal_of(structure, case)
-        model = link_model(structure, case, nominal)
-        return nominal.omega, model.state, corrections(structure, case, nominal, model.state)
+        model = bent(case, link_model(structure, case, nominal)).model
+        return nominal.omega, model.state, corrections(structure, case, nominal)
 
     omega, state, own = map(np.asarray, jax.jit(both)(case))
     period, corner = float(case.electronics.period), float(case.electronics.antialias)
     size = own.shape[2]
-    assert size == (5 if highpass else 4)
+    assert size == (6 if highpass else 5)
     for link, j in np.ndindex(3, 2):
-        at = np.arange(size) * 2 + j
+        at = np.append(np.arange(size - 1) * 2 + j, state.shape[1] - 2 + j)
         f, look = state[link][np.ix_(at, at)], np.eye(size)[2]
         error = f @ (np.eye(size) - np.outer(own[link, j], look))
         poles = np.log(np.linalg.eigvals(error)) / period
         wanted = [omega[link, j] * (-0.4 + 1j * np.sqrt(1 - 0.4**2)), corner * (-1 + 1j) / 2**0.5]
-        wanted = np.concatenate([wanted, np.conj(wanted), [-2 * np.pi * highpass][: size - 4]])
+        real = [-2 * np.pi * highpass] * (size - 5) + [-2 * np.pi * BENDING.default]
+        wanted = np.concatenate([wanted, np.conj(wanted), real])
         apart = np.abs(poles[:, None] - wanted[None]).min(axis=0)
         assert np.all(apart < 1e-5 * np.abs(wanted))
 
@@ -217,3 +234,69 @@ def test_modal_control_by_observers_damps_as_modal_filters_do():
         assert found[law].gain_margin > 2
     damping = [found[law].damping_ratio[0].mean() for law in ("imsc", "observer")]
     assert damping[1] == pytest.approx(damping[0], rel=0.25) and damping[0] > 0.02
+
+
+def command_ratio(law, structure, case):
+    """Voltage per voltage at 30 Hz over that at mode 1, of link 1's first sensor and actuator."""
+    system = jax.tree.map(np.asarray, jax.jit(controller_of, static_argnums=0)(structure, case))
+    a, b, c, d = dense(system.feedback)
+    period = float(case.electronics.period)
+
+    def gain(hertz):
+        z = np.exp(2j * np.pi * hertz * period)
+        return np.abs(c @ np.linalg.solve(z * np.eye(len(a)) - a, b) + d)[:3, :3].max()
+
+    return gain(30.0) / gain(114.4)
+
+
+@pytest.mark.parametrize("law", ["lqg", "observer"])
+def test_quasi_static_bending_is_left_alone(law):
+    """The higher `bending_hz`, the less the controller does at 30 Hz; without it 0.7 and more."""
+    ratios = []
+    for corner in (0.1, 60.0, BENDING.default):
+        control = {"law": law, "modes": 2, "laws": {law: {"bending_hz": corner}}}
+        structure, case = arrays(parse_study(SHORT | {"control": control}))
+        ratios.append(command_ratio(law, structure, case))
+    assert ratios[0] > 0.65 and ratios[1] < 0.75 * ratios[0] and ratios[2] < ratios[1]
+
+
+@pytest.mark.parametrize("law", ["lqg", "observer"])
+def test_predictions_know_the_commands_as_they_were_limited(law):
+    """The state is that of an observer that is given the limited commands, however far they go."""
+    structure, case = arrays(parse_study(SHORT | {"control": {"law": law, "modes": 2}}))
+
+    def both(case):
+        nominal = nominal_of(structure, case)
+        return controller_of(structure, case), bent(case, link_model(structure, case, nominal))
+
+    controller, (model, _) = jax.tree.map(np.asarray, jax.jit(both)(case))
+    system = controller.feedback
+    a, b, c, d = (np.asarray(x) for x in dense(system))
+    order = model.state.shape[1]
+    # x_(k+1) = (A - E C) x + (B - E D) y + E v of link 1, v limited
+    enter = model.enter[0]
+    own, ports = slice(0, order), slice(0, 3)
+    inner, seen = a[own, own] - enter @ c[ports, own], b[own, ports] - enter @ d[ports, ports]
+    rng = np.random.default_rng(3)
+    state, x, limit = rest_controller(controller), np.zeros(order), 0.05
+    controller = controller._replace(voltage_limit=limit)
+    step = jax.jit(controller_step, static_argnames="is_smooth")
+    reached = 0
+    for voltage in rng.normal(size=(60, 3, 3)) * np.array([1, 0, 0])[:, None]:
+        state, info = step(controller, state, voltage)
+        v = np.asarray(info.command)[0]
+        wanted = c[ports, own] @ x + d[ports, ports] @ np.asarray(info.measured)[0]
+        np.testing.assert_allclose(v, np.clip(wanted, -limit, limit), atol=1e-8)
+        reached += int(np.sum(np.abs(wanted) > 2 * limit))
+        x = inner @ x + seen @ np.asarray(info.measured)[0] + enter @ v
+        np.testing.assert_allclose(np.asarray(state.feedback)[0, 0], x, rtol=1e-8, atol=1e-9)
+    assert reached > 20
+
+
+def test_gain_factors_do_not_change_what_limits_tell():
+    """E (v - u)/f: half of a doubled demand's excess; and nothing where a factor is 0."""
+    structure, case = arrays(parse_study(SHORT | {"control": {"law": "lqg", "modes": 2}}))
+    system = jax.tree.map(np.asarray, jax.jit(controller_of, static_argnums=0)(structure, case))
+    one = np.asarray(system.feedback.anti_windup)
+    np.testing.assert_allclose(system.feedback.amplified(2.0).anti_windup, one / 2)
+    assert not np.any(np.asarray(system.feedback.amplified(0.0).anti_windup))

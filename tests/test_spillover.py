@@ -377,7 +377,7 @@ def comparison():
 
 def test_factors_keep_the_margin_and_the_designs_damping(comparison):
     names = comparison.names
-    assert names[:2] == ("no control", "baseline") and len(names) == 7
+    assert names[:2] == ("no control", "baseline") and len(names) == 9
     given, laws = 1, slice(2, None)
     assert np.all(comparison.margin[laws] > 2 - 1e-3)
     zeta = comparison.damping_ratio[:, 0]
@@ -438,7 +438,7 @@ def test_damping_is_that_of_links_that_control_the_mode():
     """Mode 1 of link 1 alone: the strongest of its three; link 2 has mode 2, and none mode 3."""
     mask = ((True, False, False), (False, True, False), (False, False, False))
     found = fixed_controller(STUDY.change(control__mode_mask=mask))
-    np.testing.assert_array_equal(_controlled_links(found.controller), [1, 1, 2])
+    np.testing.assert_array_equal(_controlled_links(found), [1, 1, 2])
     builder, plant = LoopBuilder(found), PlantVariant("pinned_pinned", 3)
     law = all_laws(found, builder, plant)[0]
     view = _LawLoops(found, law, plant, (3,))

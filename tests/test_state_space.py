@@ -222,6 +222,42 @@ def test_export_of_some_links_with_feedthrough(tmp_path, capsys):
     assert np.shape(document["numbers"]["state_matrix"]["value"]) == (3, 2, 2, 2)
 
 
+@pytest.mark.parametrize("end", [".npz", ".json"])
+def test_limits_are_told_where_the_file_says_how(tmp_path, capsys, end):
+    """x_(k+1) = A x + B y + E (v - u), in the loop and in exported code."""
+    a, b, c, d = random_system(4, 9, gain=0.3)
+    tell = 0.05 * np.random.default_rng(5).normal(size=(4, 9))
+    assert np.abs(np.linalg.eigvals(a - tell @ c)).max() < 1
+    matrices = {"A": a, "B": b, "C": c, "D": d, "anti_windup": tell}
+    path = tmp_path / f"one{end}"
+    if end == ".npz":
+        np.savez(path, **matrices, dt=PERIOD)
+    else:
+        path.write_text(
+            json.dumps({"dt": PERIOD} | {name: x.tolist() for name, x in matrices.items()})
+        )
+    study = study_with(path, electronics={"voltage_limit": 2.0})
+    controller = controller_of(study)
+    rng = np.random.default_rng(1)
+    codes = rng.integers(0, 4096, (200, 3, 3)).astype(float)
+    x, wanted, most = np.zeros(4), [], 0.0
+    for code in codes:
+        y = np.ravel(read_back(controller, code))
+        u = c @ x + d @ y
+        v = np.clip(u, -2, 2)
+        x = a @ x + b @ y + tell @ (v - u)
+        most = max(most, np.abs(u).max())
+        wanted.append(v.reshape(3, 3))
+    assert most > 4
+    np.testing.assert_allclose(replay(controller, codes), wanted, atol=1e-10)
+    if end == ".json":
+        (tmp_path / "study.toml").write_text(study_template(study))
+        for target in ("c", "c-fixed"):
+            options = ["--target", target, "--out", str(tmp_path)]
+            main(["export", str(tmp_path / "study.toml"), *options])
+            assert "comparisons agree" in capsys.readouterr().out
+
+
 def test_formats_and_names(tmp_path):
     """JSON, NPZ and MAT say the same; names say where ports are; a written study needs no file."""
     a, b, c, d = random_system(3, 2)

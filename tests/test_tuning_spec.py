@@ -12,6 +12,7 @@ from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.numbers import one_study
 from studies.study.paths import set_value
 from studies.study.spec import parse_study
+from studies.tuning.evaluate import Evaluator
 from studies.tuning.objective import tail_weights
 from studies.tuning.scenarios import lane_columns, scenario_columns
 from studies.tuning.spec import load_tuning, parse_tuning
@@ -430,3 +431,67 @@ def test_ready_tunings_are_valid():
     assert len(paths) >= 3
     for path in paths:
         assert len(load_tuning(path).free.names) > 1
+
+
+LAWS_TUNED = {
+    "control.laws.lqg.voltage_weight": {"from": 1e-9, "to": 1e-6, "scale": "log"},
+    "control.laws.ppf.filter_damping": {"from": 0.2, "to": 1.0},
+}
+
+
+def test_each_law_is_tuned_by_its_own_parameters():
+    """A family that names nothing frees all but other laws' parameters."""
+    families = {
+        "lqg": {"set": {"control.law": "lqg"}},
+        "ppf": {"set": {"control.law": "ppf"}},
+        "own": {},
+    }
+    spec = tuning({**GAIN, **LAWS_TUNED}, families=families)
+    moved = {family.name: list(family.is_free) for family in spec.families}
+    assert moved["own"] == [True, False, False]
+    assert moved["lqg"] == [True, True, False] and moved["ppf"] == [True, False, True]
+    assert [spec.law(family) for family in spec.families] == ["lqg", "ppf", "imsc"]
+    assert spec.law() == "imsc" and len(spec.studies("lqg")) == 1
+    assert spec.has_position_gain("ppf") and not spec.has_position_gain("imsc")
+
+
+@pytest.mark.parametrize(
+    ("free", "families", "message"),
+    [
+        (LAWS_TUNED, {"lqg": {"set": {"control.law": "lqg"}}}, "ppf.filter_damping: cannot be"),
+        (
+            {**GAIN, "control.laws.lqg.bending_hz": {"from": 20.0, "to": 200.0}},
+            {
+                "lqg": {"set": {"control.law": "lqg"}},
+                "own": {"free": ["control.laws.lqg.bending_hz"]},
+            },
+            "families.own.free: .*'imsc'",
+        ),
+    ],
+)
+def test_parameters_belong_to_a_law(free, families, message):
+    with pytest.raises(StudyError, match=message):
+        tuning(free, families=families)
+
+
+def test_designs_of_laws_are_evaluated_in_order():
+    """Families of two laws side by side: each design as in a tuning of its own law."""
+    free = {**GAIN, "control.laws.ppf.filter_damping": {"from": 0.2, "to": 1.0}}
+    other = {"set": {"control.law": "ppf"}}
+    spec = tuning(free, families={"a": {}, "ppf": other, "b": {}}, starts=1)
+    evaluator = Evaluator(spec, list(spec.moving))
+    places = np.array([[0.3, 0.5], [0.2, 0.4], [0.6, 0.5]])
+    found = evaluator.evaluate(spec.free.values(places))
+    alone = tuning(GAIN, families={"a": {}, "b": {}}, starts=1)
+    wanted = Evaluator(alone, list(alone.moving)).evaluate(alone.free.values(places[[0, 2], :1]))
+    rows = [k for k, family in enumerate(spec.moving) if spec.law(family) == "imsc"]
+    np.testing.assert_allclose(found.objective[rows], wanted.objective, rtol=1e-9)
+    np.testing.assert_allclose(found.slope[rows, 0], wanted.slope[:, 0], rtol=1e-6)
+    push = next(k for k, x in enumerate(spec.moving) if spec.law(x) == "ppf")
+    step = np.array([[0, 1e-4]])
+    ahead, back = (
+        evaluator.evaluate(spec.free.values(places + sign * step), False) for sign in (1, -1)
+    )
+    width = spec.free.slopes(places[push])[1]
+    difference = (ahead.objective[push] - back.objective[push]) / 2e-4
+    assert found.slope[push, 1] * width == pytest.approx(difference, rel=1e-3)

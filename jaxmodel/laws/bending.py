@@ -24,7 +24,7 @@ LEAK = 0.01
 #: Field of laws with such a state.
 BENDING = Parameter(
     "bending_hz",
-    60.0,
+    120.0,
     "Hz",
     "frequency below which modal forces count as those of the move, whose bending is left alone",
     0.1,

@@ -14,6 +14,7 @@ from functools import reduce
 from jaxmodel.case import Case, Structure
 from jaxmodel.laws.bending import BENDING, bent, force_decay
 from jaxmodel.laws.contract import Law, NominalModel, Parameter, acting_channels
+from jaxmodel.laws.imsc import same
 from jaxmodel.laws.link_model import (
     DAMPING,
     LinkModel,
@@ -164,4 +165,5 @@ OBSERVER = Law(
         BENDING,
         DAMPING,
     ),
+    as_strong=same,
 )

@@ -112,7 +112,7 @@ class _LawLoops:
     ) -> None:
         self.law, builder = law, LoopBuilder(design)
         self.limit, self.breaking = HIGHEST, ""
-        self._n_links = _controlled_links(design.controller)
+        self._n_links = _controlled_links(design)
         parts = linear_parts(law.controller)
         self._parts = [(modes, builder.loop(plant, part)) for modes, part in parts]
         for _, part in parts:
@@ -165,9 +165,11 @@ class _LawLoops:
         return damping
 
 
-def _controlled_links(law: Controller) -> np.ndarray:
+def _controlled_links(design: FixedController) -> np.ndarray:
     """How many links control each of modes 1 to `SHOWN`; if none does, all links with gains."""
-    is_on = law.feedback.acting
+    is_on = design.controller.feedback.acting
+    if not is_on.size:  # a system from sensors to actuators
+        return np.full(SHOWN, sum(design.study.control.links))
     is_on, n_links = is_on[:, :SHOWN], is_on.any(axis=1).sum()
     count = np.pad(is_on.sum(axis=0), (0, SHOWN - is_on.shape[1]))
     return np.where(count > 0, count, n_links)
@@ -177,12 +179,21 @@ def _run(design: FixedController, laws: list[Controller]) -> tuple[Study, Result
     """The design's first move made fast under each law, and the study of it."""
     study = _fast_move(design.study)
     structure, case = check_run(study)
-    # a channel per patch, whatever the law
+    # a channel per patch, whatever the law with channels
     structure = structure._replace(
         law=SRF.name, n_frequencies=1, metrics=("residual_rms", "peak_voltage", "control_energy")
     )
-    stacked = jax.tree.map(lambda *x: np.stack(x), *laws)
-    return study, jax.tree.map(np.asarray, _simulate(structure, case, stacked))
+    shapes = [jax.tree.map(np.shape, law) for law in laws]
+    order, results = [], []
+    for k, shape in enumerate(shapes):
+        if k in order:
+            continue
+        alike = [j for j in range(k, len(laws)) if shapes[j] == shape]
+        stacked = jax.tree.map(lambda *x: np.stack(x), *(laws[j] for j in alike))
+        results.append(jax.tree.map(np.asarray, _simulate(structure, case, stacked)))
+        order += alike
+    back = np.argsort(order)
+    return study, jax.tree.map(lambda *x: np.concatenate(x)[back], *results)
 
 
 @kept_jit(static_argnums=0)

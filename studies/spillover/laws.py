@@ -1,7 +1,7 @@
 """Control laws for one machine: coefficients of the same sampled controller, of equal strength.
 
 Each law has the design's patches, modes, electronics and feed-through compensation; factor 1 gives
-mode 1 the damping that the design's own gains intend.
+mode 1 the damping that the design's own gains intend, a law from a file what it gives.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from jaxmodel.controller import Controller, with_gains
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law, as_modal
 from jaxmodel.laws.imsc import IMSC
+from jaxmodel.laws.state_space import STATE_SPACE
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import design_controller
 from studies.engine.controller import FixedController
@@ -31,7 +32,7 @@ ROUNDING = 1e-9
 
 
 class Candidate(NamedTuple):
-    """A control law with a channel for each patch, see `pad_channels`."""
+    """A control law; one with channels has one for each patch, see `pad_channels`."""
 
     law: Law
     controller: Controller  # at factor 1
@@ -52,13 +53,7 @@ def all_laws(design: FixedController, builder: LoopBuilder, plant: PlantVariant)
     Raises:
         StudyError: velocity gains that do not damp mode 1, so nothing to compare strength by.
     """
-    control, own_law = design.study.control, LAWS[design.study.control.law]
-    channels = {name: law for name, law in LAWS.items() if law.channel != "none"}
-    if own_law.name not in channels:
-        raise field_error(
-            "control.law", control.law, f"{', '.join(channels)}, to compare laws of equal strength"
-        )
-
+    control = design.study.control
     controller = design.controller
 
     def strength(law: Controller) -> np.ndarray:
@@ -70,7 +65,7 @@ def all_laws(design: FixedController, builder: LoopBuilder, plant: PlantVariant)
 
     modal = controller if control.law == IMSC.name else _design_law(design, IMSC)
     # a law without velocity feedback counts as strong as modal control with the same settings
-    target = strength(controller if np.any(_channels(controller).velocity_gain) else modal)
+    target = strength(controller if _has_velocity_gain(controller) else modal)
     if not np.any(target > 0) or np.any(target < 0):
         raise field_error(
             "control.velocity_gain",
@@ -99,13 +94,20 @@ def all_laws(design: FixedController, builder: LoopBuilder, plant: PlantVariant)
         Candidate(
             law, _unify_channels(own[name] if name in own else as_strong(law), design.n_patches)
         )
-        for name, law in channels.items()
+        for name, law in LAWS.items()
+        if name in own or law is not STATE_SPACE
     ]
 
 
+def _has_velocity_gain(law: Controller) -> bool:
+    return isinstance(law.feedback, Channels) and bool(np.any(law.feedback.velocity_gain))
+
+
 def _unify_channels(law: Controller, n_channels: int) -> Controller:
-    """With a channel for each patch and rivals, if none: one shape for all laws."""
-    channels = _channels(law)
+    """With a channel for each patch and rivals, if none: one shape for all laws with channels."""
+    if not isinstance(law.feedback, Channels):
+        return law
+    channels = law.feedback
     if channels.rival_omega is None:
         channels = channels._replace(rival_omega=np.zeros_like(channels.velocity_gain))
     return pad_channels(law._replace(feedback=channels), n_channels)

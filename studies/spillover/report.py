@@ -9,6 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from jaxmodel.laws import LAWS
+from jaxmodel.laws.state_space import STATE_SPACE
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 from studies.show.document import json_text
 from studies.show.pages import page
@@ -99,6 +100,7 @@ def report(certificate: Certificate, laws: Comparison | None, images: Path | Non
         window=WINDOW,
         law_modes=[f"zeta {j + 1}" for j in range(SHOWN)],
         law_rows=_laws(laws) if laws is not None else [],
+        has_system=laws is not None and STATE_SPACE.text in laws.names,
         sketch_caption=CAPTION,
     )
 

@@ -365,6 +365,11 @@ class StateSpaceSection(Section):
     b: Matrix = described((), "1/V", "B")
     c: Matrix = described((), "V", "C")
     d: Matrix = described((), "1", "D; empty: 0")
+    anti_windup: Matrix = described(
+        (),
+        "1/V",
+        "E: x_(k+1) gains E (v - u) where u is limited to v, as observers need it; empty: 0",
+    )
     inputs: tuple[str, ...] = described(
         (), "-", "sensors, 'sensor LINK.PATCH'; empty: all, or those of a link for each link"
     )

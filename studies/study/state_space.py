@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 FORMATS = (".json", ".npz", ".mat")
 #: Matrices, and what a file may call the sample time.
 MATRICES, TIMES = ("a", "b", "c", "d"), ("sample_time", "dt", "ts")
+#: What a limit of the commands adds to the state; optional.
+ANTI_WINDUP = "anti_windup"
 #: A sample time that differs by more than this share is another one [1].
 SAME_TIME = 1e-6
 #: Largest entry of a matrix [1], so that no product of a few overflows, and number of states.
@@ -67,7 +69,7 @@ def read_system(path: Path) -> dict[str, Any]:
         raise StudyError(f"{name}: {path} cannot be read ({error})") from None
     section: dict[str, Any] = {
         key: _matrix(entries[key], f"{name}: {path}: {key.upper()}")
-        for key in MATRICES
+        for key in (*MATRICES, ANTI_WINDUP)
         if key in entries
     }
     if section.get("d") and not any(any(section.get(key, ())) for key in MATRICES[:3]):
@@ -164,6 +166,7 @@ def system_of(section: StateSpaceSection, n_patches: int) -> StateSpace:
         b = np.zeros((0, max(map(len, section.d), default=0)))
     shape = (len(c), b.shape[1])
     d = _sized(section.d, "d", shape) if section.d else np.zeros(shape)
+    tell = _sized(section.anti_windup or ((0.0,) * len(c),) * order, ANTI_WINDUP, (order, len(c)))
     every = 3 * n_patches
     if not section.inputs and not section.outputs and shape == (n_patches, n_patches):
         groups = 3  # the same controller for each link
@@ -177,7 +180,7 @@ def system_of(section: StateSpaceSection, n_patches: int) -> StateSpace:
             )
         )
         columns, rows = np.eye(every)[inputs], np.eye(every)[:, outputs]
-        b, c, d = b @ columns, rows @ c, rows @ d @ columns
+        b, c, d, tell = b @ columns, rows @ c, rows @ d @ columns, tell @ rows.T
     radius = _radius(a)
     if not radius <= UNSTABLE:
         raise StudyError(
@@ -185,12 +188,20 @@ def system_of(section: StateSpaceSection, n_patches: int) -> StateSpace:
             "1 at most"
         )
     try:
-        form = modal_form(a, b, c)
+        form = modal_form(a, np.hstack([b, tell]) if section.anti_windup else b, c)
     except IllConditionedError as error:
         raise StudyError(f"state_space.a: {error}") from None
     size = every // groups
-    system = StateSpace(form.state, form.enter, form.leave, d.reshape(size, size))
-    return StateSpace(*(np.repeat(part[None], groups, axis=0) for part in system))
+    system = StateSpace(
+        state=form.state,
+        enter=form.enter[..., :size],
+        leave=form.leave,
+        direct=d.reshape(size, size),
+        anti_windup=form.enter[..., size:] if section.anti_windup else None,
+    )
+    return StateSpace(
+        *(None if part is None else np.repeat(part[None], groups, axis=0) for part in system)
+    )
 
 
 def _radius(a: np.ndarray) -> float:
