@@ -35,15 +35,17 @@ BACKGROUND, BESIDE = 120, np.tan(np.linspace(-1.45, 1.45, 12))
 LOWEST_HZ = 0.5
 #: Local maxima whose scaling is optimised, and those that are refined.
 LOOKED_AT, REFINED = 6, 2
+#: Zooms on a maximum, and points of each.
+ZOOMS, POINTS = 4, 5
 #: Frequencies at which an eigenvalue of L can have modulus 1, at most.
 STRONG = 288
 #: Steps of delay [samples] and of phase [rad] on the map of crossings, and steps of one part of it.
 DELAY_STEP, PHASE_STEP, PART = 1 / 8, np.pi / 32, 16
-#: Cells of the map that are refined, and Newton's steps in each.
-CELLS, NEWTON = 4, 10
+#: Cells of the map that are refined, eigenvalues in each, and Newton's steps.
+CELLS, EACH, NEWTON = 3, 4, 8
 
 
-def loop_figures(response: SampledLoopResponse, names: tuple[str, ...]) -> dict[str, Array]:
+def robustness_figures(response: SampledLoopResponse, names: tuple[str, ...]) -> dict[str, Array]:
     """Figures of a stable loop.
 
     Args:
@@ -59,7 +61,7 @@ def loop_figures(response: SampledLoopResponse, names: tuple[str, ...]) -> dict[
         `disturbance_deflection_peak`, of held slider forces to chord deflections [m/N].
 
     Example:
-        >>> figures = loop_figures(response, ("disk_margin",))  # doctest: +SKIP
+        >>> figures = robustness_figures(response, ("disk_margin",))  # doctest: +SKIP
     """
     fixed = jax.lax.stop_gradient(response)
     omega = search_frequencies(fixed)
@@ -139,22 +141,34 @@ def _local_maxima(value: Array, count: int) -> Array:
     return jax.lax.top_k(jnp.where((value >= left) & (value >= right), value, 0.0), count)[1]
 
 
-def _refined(evaluate: Callable[[Array], Array], omega: Array, place: Array) -> Array:
-    """Where a function is largest between the neighbours of a place on the grid [rad/s], ()."""
-    low = omega[jnp.maximum(place - 1, 0)]
-    high = omega[jnp.minimum(place + 1, omega.size - 1)]
-    left, right = low, high
-    points, value = left[None], jnp.zeros(1)
-    for count in (9, 9, 9):
-        points = left + (right - left) * np.linspace(0, 1, count)
-        value = jax.lax.map(evaluate, points)
-        best = jnp.clip(jnp.argmax(value), 1, count - 2)
-        left, right = points[best - 1], points[best + 1]
+def _refined(
+    evaluate: Callable[[Array], Array], omega: Array, place: Array
+) -> tuple[Array, Array]:
+    """Where a function is largest between the neighbours of a place on the grid, and its value.
+
+    Zooming in, then the vertex of a parabola.
+    """
+    left = omega[jnp.maximum(place - 1, 0)]
+    right = omega[jnp.minimum(place + 1, omega.size - 1)]
+
+    def zoom(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        points, value = state
+        best = jnp.clip(jnp.argmax(value), 1, POINTS - 2)
+        points = points[best - 1] + (points[best + 1] - points[best - 1]) * share
+        return points, jax.lax.map(evaluate, points)
+
+    share = np.linspace(0, 1, POINTS)
+    # the first zoom takes the whole interval
+    wide = jnp.full(POINTS, right).at[0].set(left)
+    start = wide, jnp.zeros(POINTS).at[1].set(1.0)
+    points, value = jax.lax.fori_loop(0, ZOOMS, zoom, start)
+    best = jnp.clip(jnp.argmax(value), 1, POINTS - 2)
     before, here, after = (value[best + k] for k in (-1, 0, 1))
     bend = before - 2 * here + after
-    shift = jnp.where(bend < 0, (before - after) / jnp.where(bend < 0, 2 * bend, 1.0), 0.0)
-    vertex = points[best] + jnp.clip(shift, -1, 1) * (points[1] - points[0])
-    return jnp.where(evaluate(vertex) >= jnp.max(value), vertex, points[jnp.argmax(value)])
+    is_round = (here >= jnp.maximum(before, after)) & (bend < 0)
+    shift = jnp.where(is_round, (before - after) / jnp.where(is_round, 2 * bend, 1.0), 0.0)
+    vertex = points[best] + shift * (points[1] - points[0])
+    return jnp.where(is_round, vertex, points[jnp.argmax(value)]), jnp.max(value)
 
 
 def _norm_peak(
@@ -170,8 +184,8 @@ def _norm_peak(
         return jnp.linalg.svd(matrix(fixed, w), compute_uv=False)[0]
 
     places = _local_maxima(coarse, REFINED)
-    found = jax.lax.map(lambda k: _refined(norm, omega, k), places)
-    at = found[jnp.argmax(jax.lax.map(norm, found))]
+    found, value = jax.lax.map(lambda k: _refined(norm, omega, k), places)
+    at = found[jnp.argmax(value)]
     left, size, right = jnp.linalg.svd(jax.lax.stop_gradient(matrix(fixed, at)))
     slope = jnp.real(jnp.conj(left[:, 0]) @ matrix(response, at) @ jnp.conj(right[0]))
     return size[0] + slope - jax.lax.stop_gradient(slope)
@@ -193,8 +207,8 @@ def _disk_margin(response: SampledLoopResponse, omega: Array, coarse: Array) -> 
     places = _local_maxima(rough, LOOKED_AT)
     better = jax.lax.map(lambda k: best_scaling(excess(coarse[k])).bound, places)
     places = places[jax.lax.top_k(better, REFINED)[1]]
-    found = jax.lax.map(lambda k: _refined(bound, omega, k), places)
-    at = found[jnp.argmax(jax.lax.map(bound, found))]
+    found, value = jax.lax.map(lambda k: _refined(bound, omega, k), places)
+    at = found[jnp.argmax(value)]
     best = jax.lax.stop_gradient(best_scaling(excess(command_gain(fixed, at))))
     slope = jnp.real(jnp.sum(jnp.conj(best.slope) * excess(command_gain(response, at))))
     return 1 / (best.bound + slope - jax.lax.stop_gradient(slope))
@@ -243,7 +257,7 @@ def _first_crossing(
 
     Args:
         on_grid: determinants by t, (signs, Q) from (signs,).
-        exact: the determinant of (response, omega, t, sign).
+        exact: L of (response, omega, t, sign).
         response: of the loop.
         strong: where to look.
         signs: of t.
@@ -252,10 +266,11 @@ def _first_crossing(
     """
     fixed, n_parts = jax.lax.stop_gradient(response), int(np.ceil(most / step / PART))
 
-    def cells(part: Array) -> tuple[Array, Array]:
-        """Smallest t of cells with a zero, and their numbers, (CELLS,)."""
+    def cells(part: Array) -> tuple[Array, Array, Array]:
+        """Smallest t of cells with a zero, frequencies there, and numbers, (CELLS,)."""
         t = (part * PART + np.arange(PART + 1)) * step
-        phase = jnp.angle(jax.lax.map(lambda x: on_grid(x * signs), t))  # (t, signs, Q)
+        value = jax.lax.map(lambda x: on_grid(x * signs), t)  # (t, signs, Q)
+        phase = jnp.angle(value)
 
         def turned(a: Array, b: Array) -> Array:
             return (b - a + np.pi) % (2 * np.pi) - np.pi
@@ -263,81 +278,109 @@ def _first_crossing(
         along = turned(phase[:, :, :-1], phase[:, :, 1:])
         up = turned(phase[:-1], phase[1:])
         turns = along[:-1] + up[:, :, 1:] - along[1:] - up[:, :, :-1]
-        is_zero = jnp.abs(turns) > np.pi
-        start = jnp.where(is_zero, t[:-1, None, None], jnp.inf)
-        value, number = jax.lax.top_k(-jnp.ravel(start), CELLS)
-        return -value, number
+        # where in the cell, by a plane through three corners
+        corner = value[:-1, :, :-1]
+        dw, dt = _solve(corner, value[:-1, :, 1:] - corner, value[1:, :, :-1] - corner)
+        at = t[:-1, None, None] + step * jnp.clip(dt, 0, 1)
+        at = jnp.where(jnp.abs(turns) > np.pi, at, jnp.inf)
+        width = strong.omega[1:] - strong.omega[:-1]
+        omega = strong.omega[:-1] + width * jnp.clip(dw, 0, 1)
+        first, number = jax.lax.top_k(-jnp.ravel(at), CELLS)
+        return -first, jnp.ravel(omega)[number], number
 
-    def advance(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def advance(state: tuple[Array, ...]) -> tuple[Array, ...]:
         return state[0] + 1, *cells(state[0])
 
-    nothing = jnp.full(CELLS, jnp.inf), jnp.zeros(CELLS, jnp.int32)
-    first = jnp.where(strong.is_any, 0, n_parts), *nothing
-    _, start, number = jax.lax.while_loop(
-        lambda state: (state[0] < n_parts) & jnp.isinf(state[1][0]), advance, first
+    nothing = jnp.full(CELLS, jnp.inf), jnp.ones(CELLS), jnp.zeros(CELLS, jnp.int32)
+    begin = jnp.where(strong.is_any, 0, n_parts), *nothing
+    _, start, near, number = jax.lax.while_loop(
+        lambda state: (state[0] < n_parts) & jnp.isinf(state[1][0]), advance, begin
     )
     column = number % (strong.omega.size - 1)
+    width = strong.omega[column + 1] - strong.omega[column]
+    width = jnp.where(width > 0, width, 1.0)
     sign = jnp.asarray(signs)[number // (strong.omega.size - 1) % len(signs)]
-    left, right = strong.omega[column], strong.omega[column + 1]
 
-    def polished(cell: tuple[Array, ...]) -> tuple[Array, Array, Array]:
-        start, left, right, sign = cell
-        start = jnp.where(jnp.isinf(start), 0.0, start)
+    def guesses(cell: tuple[Array, ...]) -> tuple[Array, Array]:
+        """Several eigenvalues can reach -1 in one cell: where each does by its derivatives."""
+        start, near, width, sign = cell
+        start = jnp.where(jnp.isinf(start), step, start)
+        gain, by_w, by_t = _with_slopes(lambda w, t: exact(fixed, w, t, sign), near, start)
+        value, vector = jnp.linalg.eig(gain)
+        inverse = jnp.linalg.pinv(vector)
+        slopes = (jnp.sum(inverse.T * (x @ vector), axis=0) for x in (by_w, by_t))
+        dw, dt = _solve(1 + value, *slopes)
+        is_near = (jnp.abs(dw) < 1.5 * width) & (jnp.abs(dt) < 1.5 * step) & (start + dt > 0)
+        later, at = jax.lax.top_k(-jnp.where(is_near, start + dt, start + 4 * step), EACH)
+        is_near = is_near[at].at[-1].set(True)
+        w = jnp.where(is_near, near + dw[at], near)
+        return w.at[-1].set(near), jnp.where(is_near, -later, start).at[-1].set(start)
 
-        def newton(_: int, at: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def polished(guess: tuple[Array, ...]) -> tuple[Array, Array]:
+        near, start, width, sign = guess
+
+        def newton(_: int, at: tuple[Array, ...]) -> tuple[Array, ...]:
             w, t, _ = at
-            move = _newton_step(lambda w, t: exact(fixed, w, t, sign), w, t)
-            dw = jnp.clip(move[0], left - right, right - left)
-            dt = jnp.clip(move[1], -step, step)
-            return w + dw, t + dt, jnp.abs(dt) / step + jnp.abs(dw) / (right - left)
+            dw, dt = _newton_step(lambda w, t: _determinant(exact(fixed, w, t, sign)), w, t)
+            dw, dt = jnp.clip(dw, -width, width), jnp.clip(dt, -step, step)
+            return w + dw, t + dt, jnp.abs(dt) / step + jnp.abs(dw) / width
 
-        at = (left + right) / 2, start + step / 2, jnp.inf
-        w, t, last = jax.lax.fori_loop(0, NEWTON, newton, at)
-        is_near = (jnp.abs(t - start - step / 2) < 2 * step) & (t > 0) & (last < 1e-6)
-        return w, jnp.where(is_near, t, jnp.inf), sign
+        w, t, last = jax.lax.fori_loop(0, NEWTON, newton, (near, start, jnp.inf))
+        is_there = (jnp.abs(t - start) < 3 * step) & (t > 0) & (last < 1e-6)
+        return w, jnp.where(is_there, t, jnp.inf)
 
-    w, t, sign = jax.lax.map(polished, (start, left, right, sign))
-    t = jnp.where(jnp.isinf(start), jnp.inf, t)
+    near, first = map(jnp.ravel, jax.lax.map(guesses, (start, near, width, sign)))
+    width, sign = jnp.repeat(width, EACH), jnp.repeat(sign, EACH)
+    w, t = jax.lax.map(polished, (near, first, width, sign))
+    t = jnp.where(jnp.repeat(jnp.isinf(start), EACH), jnp.inf, t)
     best = jnp.argmin(t)
     w, t, sign = w[best], t[best], sign[best]
     has_one = jnp.isfinite(t)
-    w, at = jnp.where(has_one, w, strong.omega[0]), jnp.where(has_one, t, step)
-    move = _newton_step(lambda w, t: exact(fixed, w, t, sign), w, at, response, exact, sign)
-    slope = jnp.where(has_one, move[1], 0.0)
-    # a zero that Newton's iteration has lost: the near end of its cell
-    value = jnp.where(has_one, at, jnp.minimum(start[0], most))
+    # where Newton's iteration has lost the zero: its first guess
+    value = jnp.where(has_one, t, jnp.minimum(start[0], most))
+    w, t = jnp.where(has_one, w, strong.omega[0]), jnp.where(has_one, t, step)
+    moved = _determinant(exact(response, w, t, sign))
+    change = _newton_step(lambda w, t: _determinant(exact(fixed, w, t, sign)), w, t, moved)[1]
+    slope = jnp.where(has_one, change, 0.0)
     return jnp.minimum(value + slope - jax.lax.stop_gradient(slope), most)
 
 
-def _newton_step(
-    fixed: Callable[[Array, Array], Array],
-    w: Array,
-    t: Array,
-    response: SampledLoopResponse | None = None,
-    exact: Callable[..., Array] | None = None,
-    sign: Array | None = None,
-) -> Array:
-    """Change of (omega, t) that brings a determinant to 0; differentiable by `response`, (2,)."""
-    value, by_w = jax.jvp(lambda x: fixed(x, t), (w,), (jnp.ones_like(w),))
-    by_t = jax.jvp(lambda x: fixed(w, x), (t,), (jnp.ones_like(t),))[1]
-    if exact is not None:
-        value = exact(response, w, t, sign)
-    # Im(conj(a) b) of the columns of the Jacobian
+def _determinant(gain: Array) -> Array:
+    return jnp.linalg.det(np.eye(gain.shape[-1]) + gain)
+
+
+def _with_slopes(
+    function: Callable[[Array, Array], Array], w: Array, t: Array
+) -> tuple[Array, Array, Array]:
+    """Value and derivatives by omega and t."""
+    value, by_w = jax.jvp(lambda x: function(x, t), (w,), (jnp.ones_like(w),))
+    return value, by_w, jax.jvp(lambda x: function(w, x), (t,), (jnp.ones_like(t),))[1]
+
+
+def _solve(value: Array, by_w: Array, by_t: Array) -> tuple[Array, Array]:
+    """Real (dw, dt) with value + by_w dw + by_t dt = 0, complex numbers."""
     area = jnp.imag(jnp.conj(by_w) * by_t)
     area = jnp.where(area == 0, 1.0, area)
-    return jnp.stack([-jnp.imag(jnp.conj(value) * by_t), -jnp.imag(jnp.conj(by_w) * value)]) / area
+    return jnp.imag(jnp.conj(by_t) * value) / area, -jnp.imag(jnp.conj(by_w) * value) / area
+
+
+def _newton_step(
+    determinant: Callable[[Array, Array], Array], w: Array, t: Array, value: Array | None = None
+) -> tuple[Array, Array]:
+    """Changes of omega and t that bring a determinant to 0, or `value` if that is given."""
+    found, by_w, by_t = _with_slopes(determinant, w, t)
+    return _solve(found if value is None else value, by_w, by_t)
 
 
 def _phase_margin(response: SampledLoopResponse, strong: _Strong) -> Array:
     """Smallest common phase that makes the loop unstable [rad], ()."""
     total = jnp.sum(strong.images, axis=1)
-    eye = np.eye(total.shape[-1])
 
     def on_grid(phase: Array) -> Array:
-        return jax.vmap(lambda x: jnp.linalg.det(eye + jnp.exp(-1j * x) * total))(phase)
+        return jax.vmap(lambda x: _determinant(jnp.exp(-1j * x) * total))(phase)
 
     def exact(response: SampledLoopResponse, w: Array, t: Array, sign: Array) -> Array:
-        return jnp.linalg.det(eye + jnp.exp(-1j * sign * t) * command_gain(response, w))
+        return jnp.exp(-1j * sign * t) * command_gain(response, w)
 
     both = np.array([1.0, -1.0])
     return _first_crossing(on_grid, exact, response, strong, both, PHASE_STEP, np.pi)
@@ -345,14 +388,14 @@ def _phase_margin(response: SampledLoopResponse, strong: _Strong) -> Array:
 
 def _delay_margin(response: SampledLoopResponse, strong: _Strong) -> Array:
     """Smallest common delay that makes the loop unstable [samples], ()."""
-    eye, order = np.eye(strong.images.shape[-1]), np.arange(-FEW, FEW + 1)
+    order = np.arange(-FEW, FEW + 1)
     angle = strong.omega[:, None] * response.plant.period + 2 * np.pi * order  # (Q, I)
 
     def on_grid(delay: Array) -> Array:
         turned = jnp.exp(-1j * angle * delay[0])
-        return jnp.linalg.det(eye + jnp.einsum("qi,qiab->qab", turned, strong.images))[None]
+        return _determinant(jnp.einsum("qi,qiab->qab", turned, strong.images))[None]
 
     def exact(response: SampledLoopResponse, w: Array, t: Array, sign: Array) -> Array:
-        return jnp.linalg.det(eye + command_gain(response, w, t))
+        return command_gain(response, w, t)
 
     return _first_crossing(on_grid, exact, response, strong, np.ones(1), DELAY_STEP, MOST_DELAY)

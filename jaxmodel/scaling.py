@@ -3,7 +3,7 @@
 mu(M) <= min over diagonal D > 0 of the largest singular value of D M D^-1 (Doyle 1982). With
 D = exp(x) that is convex in x. For gamma above sigma^2 so are -log det(gamma - A'A), A = D M D^-1,
 whose minima lead to the best D as gamma falls: a method of centres (Boyd and El Ghaoui 1993) with
-Newton's steps in closed form, a fixed number of them, also where singular values coincide.
+Newton's steps in closed form, at most `STEPS` of them, also where singular values coincide.
 """
 
 from __future__ import annotations
@@ -40,15 +40,16 @@ def _balance(matrix: Array, sweeps: int = SWEEPS) -> Array:
     """ln of the diagonal of D that minimises the sum of squares (Osborne 1960), (n,)."""
     n = matrix.shape[0]
     square = jnp.abs(matrix) ** 2 * (1 - np.eye(n))
-    x = jnp.zeros(n, square.dtype)
-    for _ in range(sweeps):
-        for k in range(n):
-            factor = jnp.exp(2 * x)
-            row = factor[k] * jnp.sum(square[k] / factor)
-            column = jnp.sum(factor * square[:, k]) / factor[k]
-            is_there = (row > 0) & (column > 0)
-            ratio = jnp.where(is_there, column, 1.0) / jnp.where(is_there, row, 1.0)
-            x = x.at[k].add(jnp.log(ratio) / 4)
+
+    def balance(number: Array, x: Array) -> Array:
+        k, factor = number % n, jnp.exp(2 * x)
+        row = factor[k] * jnp.sum(square[k] / factor)
+        column = jnp.sum(factor * square[:, k]) / factor[k]
+        is_there = (row > 0) & (column > 0)
+        ratio = jnp.where(is_there, column, 1.0) / jnp.where(is_there, row, 1.0)
+        return x.at[k].add(jnp.log(ratio) / 4)
+
+    x = jax.lax.fori_loop(0, sweeps * n, balance, jnp.zeros(n, square.dtype))
     return jnp.clip(x - jnp.mean(x), -WIDEST, WIDEST)
 
 
@@ -71,27 +72,28 @@ def best_scaling(matrix: Array) -> BestScaling:
     """
     matrix = matrix + 0j
 
-    def step(carried: tuple[Array, ...], _: None) -> tuple[tuple[Array, ...], None]:
-        x, distance, best, best_x = carried
+    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        number, x, distance, least, best = state
         a = _apply(matrix, x)
         square = jnp.linalg.eigvalsh(jnp.conj(a.T) @ a)[-1]
-        is_best = square < best
-        best, best_x = jnp.where(is_best, square, best), jnp.where(is_best, x, best_x)
+        best = jnp.where(square < least, x, best)
         gradient, curvature = _barrier(a, square * (1 + distance))
         move = -jnp.linalg.solve(curvature, gradient)
         decrement = jnp.sqrt(jnp.maximum(-jnp.sum(move * gradient), 0.0))
         x = jnp.clip(x + move / (1 + decrement), -WIDEST, WIDEST)
-        smaller = jnp.maximum(distance * SHRINK, LAST)
-        return (x, jnp.where(decrement < CENTRED, smaller, distance), best, best_x), None
+        distance = jnp.where(decrement < CENTRED, distance * SHRINK, distance)
+        return number + 1, x, distance, jnp.minimum(square, least), best
 
-    x, infinite = _balance(matrix), jnp.array(jnp.inf)
-    start = x, jnp.array(FIRST), infinite.astype(x.dtype), x
-    (_, distance, _, x), _ = jax.lax.scan(step, start, None, length=STEPS)
+    x = _balance(matrix)
+    start = 0, x, jnp.array(FIRST, x.dtype), jnp.array(jnp.inf, x.dtype), x
+    *_, distance, _, x = jax.lax.while_loop(
+        lambda state: (state[0] < STEPS) & (state[2] > LAST), step, start
+    )
     a = _apply(matrix, x)
     value, vector = jnp.linalg.eigh(jnp.conj(a.T) @ a)
     bound = jnp.sqrt(jnp.maximum(value[-1], 0.0))
     # the singular vectors count as the barrier weighs them: several where some coincide
-    weight = 1 / (value[-1] * (1 + jnp.maximum(distance, 1e-12)) - value)
+    weight = 1 / (value[-1] * (1 + distance) - value)
     z = (vector * weight) @ jnp.conj(vector.T) / jnp.sum(weight)
     slope = a @ z / jnp.maximum(bound, jnp.finfo(bound.dtype).tiny)
     return BestScaling(bound, x, slope * jnp.exp(x[:, None] - x))

@@ -15,7 +15,7 @@ from scipy.optimize import brentq, minimize, minimize_scalar
 from jaxmodel.frequency_response import close_loop, command_gain, response_of_loop
 from jaxmodel.laws import LAWS
 from jaxmodel.prepare import prepare
-from jaxmodel.robustness import MARGINS, PEAKS, guaranteed_range, loop_figures
+from jaxmodel.robustness import MARGINS, PEAKS, guaranteed_range, robustness_figures
 from jaxmodel.sampled_loop import (
     _with_electronics,
     closed_loop,
@@ -73,7 +73,7 @@ def loop_of(name: str, law: str = "imsc", factor: float = 0.5) -> Loop:
     return Loop(structure, case, response, jax.tree.map(np.asarray, matrices), period)
 
 
-_figures = jax.jit(loop_figures, static_argnums=1)
+_figures = jax.jit(robustness_figures, static_argnums=1)
 
 
 def exact_gain(loop: Loop, omega: float) -> np.ndarray:
@@ -140,11 +140,6 @@ def delayed(loop: Loop, delay: float) -> float:
     for before, after in zip(held, held[1:], strict=False):
         closed[after, before] = np.eye(k)
     return radius(closed)
-
-
-@cache
-def _plant(structure, case_id):
-    raise NotImplementedError
 
 
 def analogue_of(loop: Loop) -> Any:

@@ -17,7 +17,7 @@ from jaxmodel.frequency_response import SampledLoopResponse, response_of_loop
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.imsc import IMSC
 from jaxmodel.prepare import prepare
-from jaxmodel.robustness import MARGINS, loop_figures
+from jaxmodel.robustness import MARGINS, robustness_figures
 from studies.engine.plan import padded_rows
 from studies.engine.programs import kept_jit
 from studies.engine.stability import with_margin_modes
@@ -87,7 +87,8 @@ def _figures_of(
     return {name: np.concatenate([part[name] for part in judged])[:count] for name in names}
 
 
-@kept_jit(static_argnums=0)
+# compiled without optimisation: it takes a fraction of the time
+@kept_jit(static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})
 def _responses(structure: Structure, cases: Case) -> SampledLoopResponse:
     def one(case: Case) -> SampledLoopResponse:
         loop = prepare(structure, case).loop
@@ -98,4 +99,4 @@ def _responses(structure: Structure, cases: Case) -> SampledLoopResponse:
 
 @kept_jit(static_argnums=0)
 def _figures(names: tuple[str, ...], responses: SampledLoopResponse) -> dict[str, Any]:
-    return jax.lax.map(lambda response: loop_figures(response, names), responses)
+    return jax.lax.map(lambda response: robustness_figures(response, names), responses)

@@ -150,7 +150,7 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
     from studies.show.listing import print_rows
     from studies.single.summary import limits_text, link_rows
     from studies.study.labels import describe, remedy
-    from studies.study.margin import MARGIN_MODES, caution, margin_in_db
+    from studies.study.margin import MARGIN_MODES, caution, margin_in_db, robustness_text
     from studies.study.spec import AUTO
 
     windows = run.case.windows
@@ -179,6 +179,8 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
         f"({max(MARGIN_MODES, modes)} plant modes per link, the run {modes})",
         soft_wrap=True,
     )
+    if run.loop.robustness:
+        console.print(robustness_text(run.loop.robustness), soft_wrap=True)
     if run.poles is not None:
         poles = Table(*HEADER)
         for row in pole_rows(run.poles):
