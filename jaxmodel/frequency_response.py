@@ -2,8 +2,8 @@
 
 A sampler sees the sum of the plant's responses at s_n = j omega + 2 pi j n/T. Links couple only
 through the pose, so each response is a sum over the modes of each link and a system of three
-equations for the pose (docs/theory.md, "Margins by frequency response"). The sum over n is complete:
-the images that are not evaluated follow a power law, whose sum is known.
+equations for the pose (docs/theory.md, "Margins by frequency response"). The sum over n is
+complete: the images that are not evaluated follow a power law, whose sum is known.
 
 All responses are complex, of commands [V] to sampled sensor voltages [V], link by link, patch by
 patch, for any law; those of forces on the sliders [N] and of chord deflections [m] are beside them.

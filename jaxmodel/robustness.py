@@ -3,7 +3,7 @@
 Each figure is searched on a grid that follows the machine's modes, then refined with the complete
 response. Figures are differentiable: where a peak or a crossing lies does not change its value to
 first order, so gradients are taken at the place found (envelope theorem), by all numbers of
-`SampledLoopResponse`. A stable loop is assumed. See docs/theory.md, "Margins by frequency response".
+`SampledLoopResponse`. A stable loop is assumed. docs/theory.md, "Margins by frequency response".
 """
 
 from __future__ import annotations
@@ -78,7 +78,10 @@ def robustness_figures(response: SampledLoopResponse, names: tuple[str, ...]) ->
     peaks = [name for name in PEAKS if name in names]
     if peaks:
         coarse = jax.lax.map(
-            lambda w: {name: coarse_norm(getattr(close_loop(fixed, w, False), _FIELD[name])) for name in peaks},
+            lambda w: {
+                name: coarse_norm(getattr(close_loop(fixed, w, False), _FIELD[name]))
+                for name in peaks
+            },
             omega,
             batch_size=BATCH,
         )
@@ -141,9 +144,7 @@ def _local_maxima(value: Array, count: int) -> Array:
     return jax.lax.top_k(jnp.where((value >= left) & (value >= right), value, 0.0), count)[1]
 
 
-def _refined(
-    evaluate: Callable[[Array], Array], omega: Array, place: Array
-) -> tuple[Array, Array]:
+def _refined(evaluate: Callable[[Array], Array], omega: Array, place: Array) -> tuple[Array, Array]:
     """Where a function is largest between the neighbours of a place on the grid, and its value.
 
     Zooming in, then the vertex of a parabola.
@@ -171,9 +172,7 @@ def _refined(
     return jnp.where(is_round, vertex, points[jnp.argmax(value)]), jnp.max(value)
 
 
-def _norm_peak(
-    response: SampledLoopResponse, omega: Array, coarse: Array, field: str
-) -> Array:
+def _norm_peak(response: SampledLoopResponse, omega: Array, coarse: Array, field: str) -> Array:
     """Largest singular value over all frequencies, ()."""
     fixed = jax.lax.stop_gradient(response)
 
@@ -201,9 +200,7 @@ def _disk_margin(response: SampledLoopResponse, omega: Array, coarse: Array) -> 
     def bound(w: Array) -> Array:
         return best_scaling(excess(command_gain(fixed, w))).bound
 
-    rough = jax.lax.map(
-        lambda gain: coarse_norm(scaled(excess(gain))), coarse, batch_size=BATCH
-    )
+    rough = jax.lax.map(lambda gain: coarse_norm(scaled(excess(gain))), coarse, batch_size=BATCH)
     places = _local_maxima(rough, LOOKED_AT)
     better = jax.lax.map(lambda k: best_scaling(excess(coarse[k])).bound, places)
     places = places[jax.lax.top_k(better, REFINED)[1]]
@@ -316,32 +313,36 @@ def _first_crossing(
         w = jnp.where(is_near, near + dw[at], near)
         return w.at[-1].set(near), jnp.where(is_near, -later, start).at[-1].set(start)
 
-    def polished(guess: tuple[Array, ...]) -> tuple[Array, Array]:
+    def polished(guess: tuple[Array, ...]) -> tuple[Array, ...]:
         near, start, width, sign = guess
 
         def newton(_: int, at: tuple[Array, ...]) -> tuple[Array, ...]:
-            w, t, _ = at
-            dw, dt = _newton_step(lambda w, t: _determinant(exact(fixed, w, t, sign)), w, t)
+            w, t, *_ = at
+            value, by_w, by_t = _with_slopes(
+                lambda w, t: _determinant(exact(fixed, w, t, sign)), w, t
+            )
+            dw, dt = _solve(value, by_w, by_t)
             dw, dt = jnp.clip(dw, -width, width), jnp.clip(dt, -step, step)
-            return w + dw, t + dt, jnp.abs(dt) / step + jnp.abs(dw) / width
+            return w + dw, t + dt, jnp.abs(dt) / step + jnp.abs(dw) / width, by_w, by_t
 
-        w, t, last = jax.lax.fori_loop(0, NEWTON, newton, (near, start, jnp.inf))
+        begin = near, start, jnp.inf, 0j * near, 0j * near
+        w, t, last, *slopes = jax.lax.fori_loop(0, NEWTON, newton, begin)
         is_there = (jnp.abs(t - start) < 3 * step) & (t > 0) & (last < 1e-6)
-        return w, jnp.where(is_there, t, jnp.inf)
+        return w, jnp.where(is_there, t, jnp.inf), *slopes
 
     near, first = map(jnp.ravel, jax.lax.map(guesses, (start, near, width, sign)))
     width, sign = jnp.repeat(width, EACH), jnp.repeat(sign, EACH)
-    w, t = jax.lax.map(polished, (near, first, width, sign))
+    w, t, by_w, by_t = jax.lax.map(polished, (near, first, width, sign))
     t = jnp.where(jnp.repeat(jnp.isinf(start), EACH), jnp.inf, t)
     best = jnp.argmin(t)
-    w, t, sign = w[best], t[best], sign[best]
-    has_one = jnp.isfinite(t)
+    has_one = jnp.isfinite(t[best])
     # where Newton's iteration has lost the zero: its first guess
-    value = jnp.where(has_one, t, jnp.minimum(start[0], most))
-    w, t = jnp.where(has_one, w, strong.omega[0]), jnp.where(has_one, t, step)
-    moved = _determinant(exact(response, w, t, sign))
-    change = _newton_step(lambda w, t: _determinant(exact(fixed, w, t, sign)), w, t, moved)[1]
-    slope = jnp.where(has_one, change, 0.0)
+    value = jnp.where(has_one, t[best], jnp.minimum(start[0], most))
+    at = jnp.where(has_one, w[best], strong.omega[0]), jnp.where(has_one, t[best], step)
+    moved = _determinant(exact(response, *at, sign[best]))
+    # safe numbers where there is none, or gradients would not be numbers
+    slopes = jnp.where(has_one, by_w[best], 1.0), jnp.where(has_one, by_t[best], 1j)
+    slope = jnp.where(has_one, _solve(moved, *slopes)[1], 0.0)
     return jnp.minimum(value + slope - jax.lax.stop_gradient(slope), most)
 
 
@@ -353,8 +354,13 @@ def _with_slopes(
     function: Callable[[Array, Array], Array], w: Array, t: Array
 ) -> tuple[Array, Array, Array]:
     """Value and derivatives by omega and t."""
-    value, by_w = jax.jvp(lambda x: function(x, t), (w,), (jnp.ones_like(w),))
-    return value, by_w, jax.jvp(lambda x: function(w, x), (t,), (jnp.ones_like(t),))[1]
+
+    def both(x: Array) -> tuple[Array, Array]:
+        value = function(x[0], x[1])
+        return value, value
+
+    slopes, value = jax.jacfwd(both, has_aux=True)(jnp.stack([w, t]))
+    return value, slopes[..., 0], slopes[..., 1]
 
 
 def _solve(value: Array, by_w: Array, by_t: Array) -> tuple[Array, Array]:
@@ -362,14 +368,6 @@ def _solve(value: Array, by_w: Array, by_t: Array) -> tuple[Array, Array]:
     area = jnp.imag(jnp.conj(by_w) * by_t)
     area = jnp.where(area == 0, 1.0, area)
     return jnp.imag(jnp.conj(by_t) * value) / area, -jnp.imag(jnp.conj(by_w) * value) / area
-
-
-def _newton_step(
-    determinant: Callable[[Array, Array], Array], w: Array, t: Array, value: Array | None = None
-) -> tuple[Array, Array]:
-    """Changes of omega and t that bring a determinant to 0, or `value` if that is given."""
-    found, by_w, by_t = _with_slopes(determinant, w, t)
-    return _solve(found if value is None else value, by_w, by_t)
 
 
 def _phase_margin(response: SampledLoopResponse, strong: _Strong) -> Array:

@@ -65,9 +65,7 @@ def _of_parts(
         part = cases._replace(control=cases.control._replace(mode_mask=mask))
         parts.append(_figures_of(alone, part, names, count))
     worst = {True: np.min, False: np.max}
-    return {
-        name: worst[name in MARGINS]([part[name] for part in parts], axis=0) for name in names
-    }
+    return {name: worst[name in MARGINS]([part[name] for part in parts], axis=0) for name in names}
 
 
 def _figures_of(

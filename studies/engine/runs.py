@@ -42,13 +42,16 @@ class Run(NamedTuple):
         return shown(self)
 
 
-def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> Run:
+def run_study(
+    study: Study, has_record: bool = True, has_loop: bool = True, has_margins: bool = False
+) -> Run:
     """Run one study after checking what can be checked beforehand.
 
     Args:
         study: what to run.
         has_record: keep trajectories.
         has_loop: also judge the linearised sampled loop (takes seconds).
+        has_margins: also by disk, phase and delay margin (12 s the first time).
 
     Raises:
         StudyError: pose out of reach, singular path, motion longer than the run, stiff feedback.
@@ -64,7 +67,8 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
         loop, motion = run_report(structure, case, home, n_tracked)
         has_poles = run.status != status.UNPLACEABLE
         poles = pole_report(structure, case, loop) if has_poles else None
-        loop = loop._replace(robustness=_margins(structure, case, loop))
+        if has_margins:
+            loop = loop._replace(robustness=_margins(structure, case, loop))
     except np.linalg.LinAlgError:  # a non-finite entry
         return run._replace(status=run.status or status.NON_FINITE)
     code = judged_status(run.status, loop)

@@ -31,6 +31,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         study: Annotated[Path, typer.Argument(help="study file (TOML) or ready-made design")],
         out: Annotated[Path | None, typer.Option(help="HDF5 file for the trajectories")] = None,
         report: _Report = False,
+        margins: Annotated[
+            bool, typer.Option("--margins", help="also disk, phase and delay margin of the loop")
+        ] = False,
         precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
         as_json: AsJson = False,
     ) -> None:
@@ -39,7 +42,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.engine.runs import uncontrolled_twin
         from studies.single.run import simulate as simulate_study
 
-        run = simulate_study(study, out, report)
+        run = simulate_study(study, out, report, margins)
         if as_json:
             from studies.single.documents import run_document
 

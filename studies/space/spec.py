@@ -140,9 +140,7 @@ def parse_sweep(data: dict[str, Any]) -> SweepSpec:
     for name in sweep.robustness:
         if name not in (*MARGINS, *PEAKS):
             hint = nearest(name, (*MARGINS, *PEAKS))
-            raise field_error(
-                "sweep.robustness", name, ", ".join((*MARGINS, *PEAKS)), hint=hint
-            )
+            raise field_error("sweep.robustness", name, ", ".join((*MARGINS, *PEAKS)), hint=hint)
     screen = _parse_screen(sweep) if "screen" in data["sweep"] else None
     return SweepSpec(study=study, sweep=sweep, root=_node(sweep, "sweep"), screen=screen, data=data)
 
