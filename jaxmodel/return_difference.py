@@ -13,17 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxmodel.axial import axial_force, chord_slopes
 from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
-from jaxmodel.dynamics import mass_matrix, platform_mass
 from jaxmodel.estimator import Estimator
-from jaxmodel.kinematics import close_chain
+from jaxmodel.frequency_response import plant_response
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import Loop
 from jaxmodel.pairs import Pair, determinant, product
 from jaxmodel.parameters import Array
-from jaxmodel.plant import Plant
 
 #: Images n of the spectrum that are summed; those left out change the sum by 1e-4.
 IMAGES = (0, -1, 1, -2)
@@ -70,125 +67,31 @@ def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
     Returns:
         LoopResponse.
     """
-    plant, drive, electronics = loop.plant, loop.drive, case.electronics
     law, through = loop.controller.feedback, loop.controller.feedthrough
     assert isinstance(law, Channels)
-    pose = jnp.asarray(pose, loop.omega.dtype)
-    still = jnp.zeros_like(pose)
-
-    def rates(pose_rate: Array) -> tuple[Array, Array]:
-        chain = close_chain(plant, pose, pose_rate)
-        return chain.rho_rate, chain.gamma_rate
-
-    to_rho, to_gamma = jax.jacfwd(rates)(still)  # (3 links, 3)
-    chain = close_chain(plant, pose, still)
-    platform = mass_matrix(platform_mass(plant, chain.turn))
-    swing = -plant.tip_mass * chain.chord * chain.sine
-    mass = platform + sum(
-        jnp.einsum("i,ip,iq->pq", *terms)
-        for terms in (
-            (plant.slider_link_mass, to_rho, to_rho),
-            (plant.inertia, to_gamma, to_gamma),
-            (swing, to_rho, to_gamma),
-            (swing, to_gamma, to_rho),
-        )
-    )
-    at_c, at_b, inertia = _from_chord(plant)
-    leave = to_gamma[:, :, None] * at_c[:, None] - (
-        (chain.sine[:, None] * to_rho)[:, :, None] * at_b[:, None]
-    )
-    slope = drive.kd + drive.viscous_friction
-    if structure.has_friction:
-        slope = slope + drive.coulomb_friction / drive.friction_speed
-    stiffness = jnp.einsum("i,ip,iq->pq", drive.kp, to_rho, to_rho)
-    modal_mass = plant.modal_mass[:, None]
-    springs = None
-    if structure.has_wrench:
-        held = jnp.linalg.solve(to_rho.T, -case.load.wrench)
-        curved = jax.hessian(lambda x: jnp.sum(held * close_chain(plant, x, still).rho))(pose)
-        stiffness = stiffness - curved
-        axial = axial_force(plant, pose, still, still, case.load.wrench)
-        springs = axial[:, None, None] * chord_slopes(plant)
-    modes = _normal_modes(plant, inertia, springs)
-    leave = leave / modal_mass[:, None]
-    decay = plant.damping / modal_mass
-    observe = jnp.einsum("ick,ikr->icr", law.filter, loop.sensor)
-    act = jnp.einsum("irk,ikc->icr", loop.actuator, law.synthesizer)
-    if modes.shape is not None:
-        leave, observe, act = (
-            jnp.einsum("ipr,irs->ips", x, modes.shape) for x in (leave, observe, act)
-        )
-        decay = jnp.einsum("irs,ir,irs->is", modes.shape, decay, modes.shape)
-    enter = leave * modal_mass[:, None]
-    drag = jnp.einsum("ipr,pq,iqr->ir", enter, jnp.linalg.inv(mass), leave)
-    if not structure.is_coupled:
-        enter, drag = jnp.zeros_like(enter), jnp.zeros_like(drag)
-    left_out = jnp.zeros_like(through) if loop.left_out is None else loop.left_out.sensor
+    plant = plant_response(structure, case, loop, pose)
+    drag = jnp.einsum("ipr,pq,iqr->ir", plant.enter, jnp.linalg.inv(plant.mass), plant.leave)
     return LoopResponse(
-        mass=mass,
-        damping=jnp.einsum("i,ip,iq->pq", slope, to_rho, to_rho),
-        stiffness=stiffness,
-        square=modes.square,
-        decay=decay,
+        mass=plant.mass,
+        damping=plant.damping,
+        stiffness=plant.stiffness,
+        square=plant.square,
+        decay=plant.decay,
         lightness=1 - drag,
-        enter=enter,
-        leave=leave,
-        observe=observe,
-        act=act,
-        direct=jnp.einsum("ick,ikl,ild->icd", law.filter, left_out, law.synthesizer),
+        enter=plant.enter,
+        leave=plant.leave,
+        observe=jnp.einsum("ick,ikr->icr", law.filter, plant.sensor),
+        act=jnp.einsum("irk,ikc->icr", plant.actuator, law.synthesizer),
+        direct=jnp.einsum("ick,ikl,ild->icd", law.filter, plant.direct, law.synthesizer),
         feedthrough=jnp.einsum("ick,ikl,ild->icd", law.filter, through, law.synthesizer),
         estimator=law.estimator,
         velocity_gain=law.velocity_gain,
         position_gain=law.position_gain,
-        period=jnp.asarray(electronics.period),
-        antialias=jnp.asarray(electronics.antialias),
-        highpass=electronics.sensor_highpass if structure.has_sensor_highpass else None,
-        lag=electronics.amplifier_lag if structure.has_amplifier else None,
+        period=plant.period,
+        antialias=plant.antialias,
+        highpass=plant.highpass,
+        lag=plant.lag,
     )
-
-
-def _from_chord(plant: Plant) -> tuple[Array, Array, Array | None]:
-    """c, b and the modal inertia matrix of deflections from the chord.
-
-    The platform holds the far ends, so sliders and chords follow the pose alone. Where a mode moves
-    its end by tau_j, the frame is turned by -tau_j q_j/L against the chord:
-    c - tau J0/L, b - tau e/L and m I + tau tau^t J0/L^2 - (tau c^t + c tau^t)/L.
-
-    Returns:
-        c [kg m], (3, R); b [kg], (3, R); inertia [kg], (3, R, R), None: m I.
-    """
-    if plant.tip is None:
-        return plant.c, plant.b, None
-    turn = plant.tip / plant.length[:, None]
-    c = plant.c - plant.inertia[:, None] * turn
-    b = plant.b - plant.tip_mass[:, None] * plant.tip
-    mixed = turn[:, :, None] * (c + plant.c)[:, None]
-    eye = plant.modal_mass[:, None, None] * jnp.eye(turn.shape[1])
-    return c, b, eye - (mixed + jnp.swapaxes(mixed, 1, 2)) / 2
-
-
-class _NormalModes(NamedTuple):
-    """Of each link between held ends."""
-
-    square: Array  # omega^2 [1/s2], (3, R)
-    shape: Array | None  # in modal coordinates, of modal mass m, (3, R, R); None: themselves
-
-
-def _normal_modes(plant: Plant, inertia: Array | None, springs: Array | None) -> _NormalModes:
-    """Modes of (modal inertia, stiffness with `springs` of axial forces [N/m], (3, R, R))."""
-    mass = plant.modal_mass[:, None]
-    if inertia is None and (springs is None or plant.mixed_shortening is None):
-        diagonal = 0.0 if springs is None else jnp.einsum("irr->ir", springs)
-        return _NormalModes((plant.stiffness + diagonal) / mass, None)
-    eye = jnp.eye(plant.stiffness.shape[1])
-    stiffness = plant.stiffness[:, :, None] * eye + (0.0 if springs is None else springs)
-    if inertia is None:
-        return _NormalModes(*jnp.linalg.eigh(stiffness / mass[:, None]))
-    half = jnp.linalg.inv(jnp.linalg.cholesky(inertia / mass[:, None]))
-    square, shape = jnp.linalg.eigh(
-        jnp.einsum("ijr,irs,iks->ijk", half, stiffness / mass[:, None], half)
-    )
-    return _NormalModes(square, jnp.einsum("ikr,iks->irs", half, shape))
 
 
 def loop_strength(response: LoopResponse) -> Array:

@@ -126,6 +126,7 @@ class ClusterRunner:
             structure=group.structure,
             has_own_ratio=entry.has_own_ratio,
             is_judged=group.is_judged,
+            robustness=group.robustness,
             size=group.layout.size,
             rows=entry.chunk.rows,
         )

@@ -39,6 +39,7 @@ class ChunkJob(NamedTuple):
     structure: Structure  # of the chunk's group
     has_own_ratio: bool  # EMC ratios come from an uncontrolled pass
     is_judged: bool  # gain margins and damping of every loop
+    robustness: tuple[str, ...]  # further figures of every loop
     size: int  # cases in a full chunk, so that a shorter last one runs the same program
     rows: np.ndarray  # of the sweep's table, (k,)
 
@@ -108,7 +109,8 @@ def run_chunk(job: ChunkJob) -> ChunkDone:
         is_first = executor.compile_time == 0
         size = even_layout(job.size).size
         cases = chunk_cases(table, job.rows, job.structure, size)
-        started = start_chunk(executor, table, job.rows, cases, job.has_own_ratio, job.is_judged)
+        judged = job.is_judged, job.robustness
+        started = start_chunk(executor, table, job.rows, cases, job.has_own_ratio, *judged)
         judged = started.wait()
         compile_time = executor.compile_time if is_first else 0.0
         return ChunkDone(judged, executor.name, compile_time, worker.address)

@@ -15,6 +15,7 @@ from studies.engine.executor import Executor, own_ratios
 from studies.engine.margins import judge_loops, no_margins
 from studies.engine.plan import Chunk, Group, Layout, chunk_cases, local_layout
 from studies.engine.progress import Reporter
+from studies.engine.robustness import judge_robustness
 from studies.engine.stability import LoopFigures
 from studies.kernels.compilation import compiler_time
 from studies.space.table import CaseTable
@@ -89,7 +90,8 @@ class LocalRunner:
                 if is_first:
                     reporter.compiling()
                 cases = chunk_cases(table, chunk.rows, group.structure, group.layout.size)
-                started = start_chunk(executor, table, chunk.rows, cases, has_own, group.is_judged)
+                judged = group.is_judged, group.robustness
+                started = start_chunk(executor, table, chunk.rows, cases, has_own, *judged)
                 if is_first:
                     reporter.compiled(executor.name, executor.compile_time)
                 # the device computes this chunk while the previous one is written
@@ -123,6 +125,7 @@ def start_chunk(
     cases: Case,
     has_own_ratio: bool,
     is_judged: bool = True,
+    robustness: tuple[str, ...] = (),
 ) -> Started:
     """Judge the loops of a chunk and start its runs.
 
@@ -135,6 +138,7 @@ def start_chunk(
         cases: from `chunk_cases`.
         has_own_ratio: whether such a pass is needed.
         is_judged: whether the loops are judged; otherwise their margins are NaN.
+        robustness: figures of `jaxmodel.robustness` to judge them by as well.
     """
     is_first = executor.compile_time == 0
     if has_own_ratio:
@@ -147,6 +151,8 @@ def start_chunk(
     before = compiler_time()
     judge = judge_loops if is_judged else no_margins
     margins = judge(executor.structure, cases)
+    more = judge_robustness(executor.structure, cases, robustness, margins.gain_margin)
+    margins = margins._replace(robustness=more)
     spent = compiler_time() - before
     running = executor.start(cases)
     if is_first:

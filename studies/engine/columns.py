@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxmodel.metrics import METRICS
 from jaxmodel.prepare import SPECTRUM_SPAN
+from jaxmodel.robustness import MARGINS, MOST_DELAY
 from studies.space.table import CaseTable, as_numbers
 from studies.store import Variable
 from studies.study.labels import DISTANCE_TEXT, STATION_TEXT, STATUS_LABEL
@@ -73,6 +74,35 @@ PER_CASE: dict[str, tuple[Any, ...]] = {
 }
 
 
+#: Figures of a loop that are computed where `sweep.robustness` names them: unit and text.
+ON_DEMAND: dict[str, tuple[str, str]] = {
+    "disk_margin": (
+        "1",
+        "disk margin: every actuator may err at once by this size, gain and phase, 0: unstable",
+    ),
+    "phase_margin": (
+        "deg",
+        "largest phase of all actuators at once, either way, with every smaller one stable, 180: "
+        "any",
+    ),
+    "delay_margin": (
+        "1",
+        "largest further delay of all actuators, in samples, with every smaller one stable, "
+        f"{MOST_DELAY:g}: that or more",
+    ),
+    "sensitivity_peak": ("1", "largest singular value of the commands' sensitivity"),
+    "control_effort_peak": (
+        "1",
+        "largest singular value from disturbed sensor voltages to commands, V/V",
+    ),
+    "disturbance_deflection_peak": (
+        "m/N",
+        "largest singular value from slider forces to chord deflections, with control",
+    ),
+}
+PER_CASE |= {name: ((), *label) for name, label in ON_DEMAND.items()}
+
+
 #: Variables of every case of a screened sweep: what the linear model found.
 SCREENED: dict[str, tuple[Any, ...]] = {
     "screen_status": ((), STATUS_LABEL[0], "how the linear run ended", PER_CASE["status"][-1]),
@@ -85,7 +115,7 @@ POSE_AXIS = Variable(np.array(["x", "y", "phi"]), ("pose_axis",), "1", "pose com
 #: For these, the smallest entry is the worst.
 LEAST = ("damping_ratio",)
 #: For these, the largest value is the best.
-LARGEST_FIRST = ("gain_margin", "damping_ratio", "singularity_distance")
+LARGEST_FIRST = ("gain_margin", *MARGINS, "damping_ratio", "singularity_distance")
 
 
 def mask_unused(data: np.ndarray, axis: int, count: np.ndarray) -> None:

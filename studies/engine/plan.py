@@ -85,6 +85,7 @@ class Group(NamedTuple):
     is_too_stiff: np.ndarray  # drive or ideal feedback too stiff for any allowed step, (m,)
     layout: Layout
     is_judged: bool = True  # gain margins and damping of every loop
+    robustness: tuple[str, ...] = ()  # further figures of every loop
 
     def chunks(self) -> list[Chunk]:
         """All of them, chunk by chunk."""
@@ -102,6 +103,7 @@ def plan_groups(
     metrics: tuple[str, ...] = (),
     is_linear: bool = False,
     is_judged: bool = True,
+    robustness: tuple[str, ...] = (),
 ) -> list[Group]:
     """Group cases by program and lay out their chunks.
 
@@ -112,6 +114,7 @@ def plan_groups(
         metrics: those to keep; () for all.
         is_linear: run the linear model.
         is_judged: judge the loops.
+        robustness: figures of `jaxmodel.robustness` to judge them by as well.
 
     Raises:
         StudyError: too many programs.
@@ -150,6 +153,7 @@ def plan_groups(
                 is_too_stiff=is_too_stiff[place][chosen],
                 layout=layout,
                 is_judged=is_judged,
+                robustness=robustness,
             )
             groups.append(group)
     return groups

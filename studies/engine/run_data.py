@@ -15,7 +15,7 @@ from jaxmodel.metrics import METRICS
 from jaxmodel.prepare import left_out_deflection, spectrum_frequencies
 from jaxmodel.simulate import Result
 from studies import config
-from studies.engine.columns import PER_CASE, axis_variables
+from studies.engine.columns import ON_DEMAND, PER_CASE, axis_variables
 from studies.engine.poles import PoleReport
 from studies.engine.programs import kept_jit
 from studies.engine.runs import Run
@@ -127,6 +127,10 @@ def loop_variables(run: Run) -> dict[str, Variable]:
                 "1",
                 "their damping ratios",
             ),
+        }
+        variables |= {
+            name: Variable(value, (), *ON_DEMAND[name])
+            for name, value in (run.loop.robustness or {}).items()
         }
     if run.poles is not None:
         texts = ("specified", "of the nominal link's loop", "of the assembled machine's loop")

@@ -12,10 +12,12 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.case import Case, Structure, uncontrolled, with_ratio
+from jaxmodel.robustness import MARGINS
 from jaxmodel.simulate import Result, simulate
 from studies.engine.poles import PoleReport, pole_report, tracked_modes
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
+from studies.engine.robustness import judge_robustness
 from studies.engine.stability import LoopFigures, run_report
 from studies.publish import shown
 from studies.study.cases import signed_power
@@ -40,13 +42,16 @@ class Run(NamedTuple):
         return shown(self)
 
 
-def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> Run:
+def run_study(
+    study: Study, has_record: bool = True, has_loop: bool = True, has_margins: bool = False
+) -> Run:
     """Run one study after checking what can be checked beforehand.
 
     Args:
         study: what to run.
         has_record: keep trajectories.
         has_loop: also judge the linearised sampled loop (takes seconds).
+        has_margins: also by disk, phase and delay margin (12 s the first time).
 
     Raises:
         StudyError: pose out of reach, singular path, motion longer than the run, stiff feedback.
@@ -62,6 +67,8 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
         loop, motion = run_report(structure, case, home, n_tracked)
         has_poles = run.status != status.UNPLACEABLE
         poles = pole_report(structure, case, loop) if has_poles else None
+        if has_margins:
+            loop = loop._replace(robustness=_margins(structure, case, loop))
     except np.linalg.LinAlgError:  # a non-finite entry
         return run._replace(status=run.status or status.NON_FINITE)
     code = judged_status(run.status, loop)
@@ -73,6 +80,13 @@ def _run(study: Study, structure: Structure, case: Case, has_record: bool) -> Ru
     result = jax.tree.map(np.asarray, _simulate(structure, case, has_record))
     code = int(result.status)
     return Run(study=study, structure=structure, case=case, result=result, status=code)
+
+
+def _margins(structure: Structure, case: Case, loop: LoopFigures) -> dict[str, np.ndarray]:
+    """Disk, phase and delay margin of a run's loop, () each."""
+    one = jax.tree.map(lambda x: np.asarray(x)[None], case)
+    judged = judge_robustness(structure, one, MARGINS, np.array([loop.gain_margin]))
+    return {name: value[0] for name, value in judged.items()}
 
 
 def _own_ratio(study: Study, structure: Structure, case: Case, has_record: bool) -> np.ndarray:

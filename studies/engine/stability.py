@@ -57,6 +57,7 @@ class LoopFigures(NamedTuple):
     damping_ratio: Array = None  # [1], (..., J, 3): three assembled modes per link mode
     time: Array = None  # of the frozen instants of a motion [s], (k,)
     axial_force: Array = None  # tension in the links then [N], (k, 3)
+    robustness: dict[str, Array] | None = None  # of `jaxmodel.robustness`, by name, (...)
 
     @property
     def is_stable(self) -> bool:

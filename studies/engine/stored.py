@@ -18,6 +18,7 @@ from studies.engine.columns import (
     LEAST,
     LEFT_OUT,
     NOT_RUN,
+    ON_DEMAND,
     PER_CASE,
     SCREENED,
     axis_variables,
@@ -80,6 +81,7 @@ def chunk_arrays(table: CaseTable, done: Done, kept: list[str]) -> dict[str, np.
         "breaking_mode": loops.breaking_mode[:count],
         "damping_ratio": loops.least_damping[:count],
     }
+    margins |= {name: data[:count] for name, data in (loops.robustness or {}).items()}
     code = np.asarray(result.status)[:count].copy()
     code[done.chunk.is_too_stiff] = status.TOO_STIFF
     code[np.isin(code, status.FINISHED) & (margins["gain_margin"] < 1)] = status.UNSTABLE
@@ -88,6 +90,8 @@ def chunk_arrays(table: CaseTable, done: Done, kept: list[str]) -> dict[str, np.
     arrays = {"case_id": table.case_id[rows]}
     judged = {"status": code, "substeps": np.full(count, done.substeps), **margins}
     for name, (dims, *_) in PER_CASE.items():
+        if name in ON_DEMAND and name not in judged:
+            continue
         data = judged[name] if name in judged else np.asarray(getattr(result, name))[:count]
         if name in LEAST:
             data = data.copy()

@@ -203,7 +203,14 @@ class _Run:
         sweep, kept = self.spec.sweep, kept_metrics(self.spec)
         left = self._left(rows, finished_cases(self.folder.path))
         is_linear = sweep.fidelity == "linear"
-        groups = plan_groups(self.table, left, self._layout, sweep.metrics, is_linear)
+        groups = plan_groups(
+            self.table,
+            left,
+            self._layout,
+            sweep.metrics,
+            is_linear,
+            robustness=sweep.robustness,
+        )
 
         def save(done: Done) -> np.ndarray:
             arrays = chunk_arrays(self.table, done, kept)

@@ -26,7 +26,7 @@ from studies.errors import printable
 from studies.show.units import count_text, headed, number, span
 from studies.study.entries import links_text
 from studies.study.labels import describe
-from studies.study.margin import margin_in_db
+from studies.study.margin import margin_in_db, robustness_text
 from studies.study.spec import Study
 from studies.study.template import study_template
 
@@ -84,6 +84,7 @@ FILTERS: dict[str, Callable[..., str]] = {
     "span": span,
     "links": links_text,
     "margin": margin_in_db,
+    "robustness": robustness_text,
     "status": describe,
     "breakable": _breakable,
     "unbroken": _unbroken,

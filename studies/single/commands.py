@@ -31,6 +31,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         study: Annotated[Path, typer.Argument(help="study file (TOML) or ready-made design")],
         out: Annotated[Path | None, typer.Option(help="HDF5 file for the trajectories")] = None,
         report: _Report = False,
+        margins: Annotated[
+            bool, typer.Option("--margins", help="also disk, phase and delay margin of the loop")
+        ] = False,
         precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
         as_json: AsJson = False,
     ) -> None:
@@ -39,7 +42,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.engine.runs import uncontrolled_twin
         from studies.single.run import simulate as simulate_study
 
-        run = simulate_study(study, out, report)
+        run = simulate_study(study, out, report, margins)
         if as_json:
             from studies.single.documents import run_document
 
@@ -150,7 +153,7 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
     from studies.show.listing import print_rows
     from studies.single.summary import limits_text, link_rows
     from studies.study.labels import describe, remedy
-    from studies.study.margin import MARGIN_MODES, caution, margin_in_db
+    from studies.study.margin import MARGIN_MODES, caution, margin_in_db, robustness_text
     from studies.study.spec import AUTO
 
     windows = run.case.windows
@@ -179,6 +182,8 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
         f"({max(MARGIN_MODES, modes)} plant modes per link, the run {modes})",
         soft_wrap=True,
     )
+    if run.loop.robustness:
+        console.print(robustness_text(run.loop.robustness), soft_wrap=True)
     if run.poles is not None:
         poles = Table(*HEADER)
         for row in pole_rows(run.poles):

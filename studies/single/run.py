@@ -47,7 +47,10 @@ class Replay(NamedTuple):
 
 
 def simulate(
-    study: Study | str | Path, out: str | Path | None = None, has_report: bool = False
+    study: Study | str | Path,
+    out: str | Path | None = None,
+    has_report: bool = False,
+    has_margins: bool = False,
 ) -> Run:
     """Run a study with full trajectories, and write the requested files.
 
@@ -55,13 +58,15 @@ def simulate(
         study: what to run; or its file, or the name of a ready one.
         out: HDF5 file for trajectories and metrics; None: nothing is written.
         has_report: whether to also write the report next to that file.
+        has_margins: whether to also find disk, phase and delay margin.
 
     Raises:
         StudyError: a fault of the study, or a file that cannot be written.
     """
     file = _output_file(out, has_report)
     name = "STUDY" if isinstance(study, Study) else str(study)
-    run = run_study(study if isinstance(study, Study) else load_study(study))
+    study = study if isinstance(study, Study) else load_study(study)
+    run = run_study(study, has_margins=has_margins)
     if file is not None:
         write_results(file, run, has_report, name=name)
     return run

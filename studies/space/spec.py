@@ -16,7 +16,8 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, ValidationError
 
-from studies.errors import StudyError, field_error
+from jaxmodel.robustness import MARGINS, PEAKS
+from studies.errors import StudyError, field_error, nearest
 from studies.reading import check_depth
 from studies.space.methods import METHODS
 from studies.study.choices import OWN, OneOf
@@ -46,6 +47,9 @@ class Block(Section):
 class Screen(Section):
     """All cases by the linear model, and only the best of them by the whole one."""
 
+    robustness: tuple[str, ...] = described(
+        (), "-", f"further figures of every sampled loop to keep: {', '.join((*MARGINS, *PEAKS))}"
+    )
     by: str = described("residual_rms", "-", "metric, or entry of one, that the screen ranks by")
     keep: float = described(0.05, "1", "share of the cases that are run", gt=0, le=1)
     subject_to: str = described(
@@ -133,6 +137,10 @@ def parse_sweep(data: dict[str, Any]) -> SweepSpec:
     ranking = parse_entries(sweep.by, "sweep.by").metric
     if "by" in data["sweep"] and sweep.metrics and ranking not in sweep.metrics:
         raise field_error("sweep.by", sweep.by, f"one of sweep.metrics = {list(sweep.metrics)}")
+    for name in sweep.robustness:
+        if name not in (*MARGINS, *PEAKS):
+            hint = nearest(name, (*MARGINS, *PEAKS))
+            raise field_error("sweep.robustness", name, ", ".join((*MARGINS, *PEAKS)), hint=hint)
     screen = _parse_screen(sweep) if "screen" in data["sweep"] else None
     return SweepSpec(study=study, sweep=sweep, root=_node(sweep, "sweep"), screen=screen, data=data)
 
@@ -168,7 +176,7 @@ def _tuples(data: Any) -> Any:
     """Lists of blocks and cases as tuples; their contents are checked where they are used."""
     if not isinstance(data, dict):
         return data
-    listed = ("blocks", "cases", "environments", "metrics")
+    listed = ("blocks", "cases", "environments", "metrics", "robustness")
     return {k: tuple(v) if k in listed and isinstance(v, list) else v for k, v in data.items()}
 
 

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
+
+from jaxmodel.robustness import MOST_DELAY, MOST_PHASE, guaranteed_range
 
 #: Minimum number of plant modes for a margin: uncontrolled modes limit the gains [1].
 MARGIN_MODES = 12
@@ -44,3 +48,20 @@ def margin_in_db(value: float, digits: int = 4) -> str:
     """A gain margin as a factor and in decibels, for a sentence: "3.7 (11.4 dB)"."""
     text = margin_text(value, digits)
     return f"{text} ({20 * math.log10(min(value, HIGHEST)):.1f} dB)" if value > 0 else text
+
+
+def robustness_text(figures: Mapping[str, Any]) -> str:
+    """Disk, phase and delay margin for a sentence, with what the first one guarantees."""
+    disk, phase, delay = (
+        float(figures[name]) for name in ("disk_margin", "phase_margin", "delay_margin")
+    )
+    if disk == 0:
+        return "disk, phase and delay margin 0"
+    gain, turn = map(float, guaranteed_range(disk))
+    any_gain = "any gain" if math.isinf(gain) else f"a gain of +-{gain:.3g} dB"
+    return (
+        f"disk margin {disk:.3g} (every actuator at once may be off by {any_gain}, or by a phase "
+        f"of +-{turn:.3g} deg); all actuators alike: phase margin "
+        f"{'any' if phase >= MOST_PHASE else f'{phase:.3g} deg'}, delay margin "
+        f"{f'> {MOST_DELAY:g}' if delay >= MOST_DELAY else f'{delay:.3g}'} samples"
+    )

@@ -16,13 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.case import Case, Structure
+from jaxmodel.frequency_response import response_of_loop
 from jaxmodel.kinematics import singularity_distance
 from jaxmodel.linear_residual import linear_residual
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
+from jaxmodel.robustness import MARGINS, PEAKS, robustness_figures
 from jaxmodel.sampled_loop import LoopMatrices, closed_loop, slowest_decay, spillover
 from studies.engine.plan import padded_rows
 from studies.engine.programs import kept_jit
+from studies.engine.robustness import judge_robustness
 from studies.engine.stability import gain_margin
 from studies.study.cases import as_arrays, build_case, build_structure, case_of
 from studies.study.margin import MARGIN_MODES
@@ -47,6 +50,13 @@ class DesignFigures(NamedTuple):
     slowest_decay: float  # [1/s]
     spillover: float  # see `jaxmodel.sampled_loop.spillover` [1]
     singularity_distance: float  # [rad]
+    # of `jaxmodel.robustness`, nan where nothing limits them
+    disk_margin: float = np.nan  # [1]
+    phase_margin: float = np.nan  # [deg]
+    delay_margin: float = np.nan  # [samples]
+    sensitivity_peak: float = np.nan  # [1]
+    control_effort_peak: float = np.nan  # [1]
+    disturbance_deflection_peak: float = np.nan  # [m/N]
 
 
 def with_margin_modes(study: Study) -> Study:
@@ -123,8 +133,10 @@ class LinearFidelity:
         batch = next(x for x in self._batches.values() if position in x.rows)
         if batch.structure.feedback != "sampled":
             return np.zeros(len(values)), np.zeros(len(values))
-        names = self.names or ("slowest_decay",)
-        limits = self._limits[position] if self.names else np.array([STABLE])
+        # margins by frequency response take longer than all others: their designs must be stable
+        quick = [k for k, name in enumerate(self.names) if name not in (*MARGINS, *PEAKS)]
+        names = tuple(self.names[k] for k in quick) or ("slowest_decay",)
+        limits = self._limits[position, quick] if quick else np.array([STABLE])
         evaluate = partial(
             _screen_batch,
             batch.structure,
@@ -180,15 +192,31 @@ def _judged_structure(spec: TuneSpec, study: Study) -> Structure:
 
 
 def _excess(
-    structure: Structure, names: tuple[Any, ...], case: Case, matrices: LoopMatrices, limits: Array
+    structure: Structure,
+    names: tuple[Any, ...],
+    case: Case,
+    pose: Array,
+    matrices: LoopMatrices,
+    limits: Array,
 ) -> Array:
     """x/(1 + |x|) for each limit, (m,): decay rates reach hundreds of their limit on both sides.
 
     x is value/limit - 1, or -decay/STABLE of the loop with all gains times the required margin.
+    Figures of `jaxmodel.robustness` are those of stable loops: others count as 1 - decay/STABLE,
+    which is what margins reach at the edge.
     """
     period, excesses = case.electronics.period, []
+    wanted = tuple(name for name in names if name in (*MARGINS, *PEAKS))
+    if wanted:
+        loop = prepare(structure, case).loop
+        figures = robustness_figures(response_of_loop(structure, case, loop, pose), wanted)
+        own_decay = slowest_decay(matrices.open + matrices.feedback, period)
     for k, name in enumerate(names):
-        if name == "spillover":
+        if name in wanted:
+            share = figures[name] / limits[k]
+            within = 1 - share if name in MARGINS else share - 1
+            x = jnp.where(own_decay > 0, within, 1 - own_decay / STABLE)
+        elif name == "spillover":
             x = spillover(structure, case, matrices) / limits[k] - 1
         elif name == "singularity_distance":
             x = 1 - _singularity_distance(structure, case) / limits[k]
@@ -220,7 +248,8 @@ def _limit_slopes(
 ) -> tuple[Array, Array]:
     def figures(x: Array, numbers: Numbers, limit: Array) -> tuple[Array, Array]:
         case = case_of(structure, place(numbers, x))
-        excess = _excess(structure, names, case, closed_loop(structure, case, pose), limit)
+        matrices = closed_loop(structure, case, pose)
+        excess = _excess(structure, names, case, pose, matrices, limit)
         return excess, excess
 
     def one(design: tuple[Any, ...]) -> tuple[Array, Array]:
@@ -245,7 +274,7 @@ def _screen_batch(
         case = case_of(structure, place(numbers, x))
         matrices = closed_loop(structure, case, pose)
         rms = linear_residual(structure, case, matrices)
-        excess = _excess(structure, names, case, matrices, limits)
+        excess = _excess(structure, names, case, pose, matrices, limits)
         return excess, jnp.sqrt(jnp.mean(rms[np.array(links)] ** 2))
 
     return jax.lax.map(one, values)
@@ -273,9 +302,14 @@ def loop_figures(spec: TuneSpec, study: Study) -> DesignFigures:
     def poles(factor: float) -> np.ndarray:
         return np.linalg.eigvals(open_loop + factor * feedback)
 
+    margin = gain_margin(poles)
+    limited = tuple(name for name in (*MARGINS, *PEAKS) if name in spec.loop_limits)
+    one = jax.tree.map(lambda x: np.asarray(x)[None], case)
+    robust = judge_robustness(plain, one, limited, np.array([margin]))
     return DesignFigures(
-        gain_margin(poles),
+        margin,
         float(-np.log(np.abs(poles(1.0)).max()) / period),
         float(_spillover(plain, case, matrices)),
         float(_distance(plain, case)),
+        **{name: float(value[0]) for name, value in robust.items()},
     )

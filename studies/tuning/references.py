@@ -25,7 +25,7 @@ from studies.tuning.linear_fidelity import DesignFigures, loop_figures
 from studies.tuning.objective import allowed_limits, baseline_limits, judge_designs, objective_of
 from studies.tuning.optimise import KEPT, excess
 from studies.tuning.scenarios import fresh_machines, lane_columns, scenario_columns
-from studies.tuning.spec import BASELINE, Family, TuneSpec
+from studies.tuning.spec import BASELINE, LOWER, Family, TuneSpec
 
 FIELD = "control.gain_factor"
 #: Values that are scanned: this many between these multiples of the baseline's, and that itself.
@@ -175,7 +175,7 @@ def _keeps_loop(spec: TuneSpec, value: float) -> bool:
 def relative_margin(name: str, figures: DesignFigures, allowed: float) -> float:
     """How far a figure of the loop is from its limit, as a share of it; negative: violated."""
     share: float = getattr(figures, name) / allowed - 1
-    return -share if name == "spillover" else share
+    return share if name in LOWER else -share
 
 
 def reference_lines(spec: TuneSpec, baseline: JudgedDesign, references: References) -> list[str]:

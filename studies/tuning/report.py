@@ -27,10 +27,8 @@ from studies.tuning.objective import SHOWN
 from studies.tuning.optimise import GAIN, KEPT, PATIENCE, Progress, excess
 from studies.tuning.references import References, reference_lines, relative_margin, resolution_lines
 from studies.tuning.scenarios import fresh_machines, move_label
-from studies.tuning.spec import BASELINE, LOOP_LIMITS, Family, TuneSpec, label
+from studies.tuning.spec import BASELINE, LOOP_LIMITS, LOWER, Family, TuneSpec, label
 
-#: Lower limits.
-LOWER = ("gain_margin", "slowest_decay", "singularity_distance")
 #: A limit closer than this share counts as active.
 NEAR = 0.02
 #: Starts that end within this share of the best one count as equally good.

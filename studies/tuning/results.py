@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jaxmodel.metrics import METRICS
+from studies.engine.columns import ON_DEMAND
 from studies.space.table import as_numbers
 from studies.store import Variable
 from studies.study.entries import links_text, parse_entries
@@ -137,7 +138,10 @@ def _fresh(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
             before, (), unit, f"{text}, the baseline's file as it runs"
         )
     if findings.baseline.loop is not None:
-        for name, unit in LOOP_UNITS.items():
+        units = LOOP_UNITS | {
+            name: ON_DEMAND[name][0] for name in spec.loop_limits if name in ON_DEMAND
+        }
+        for name, unit in units.items():
             label = f"{name.replace('_', ' ')} of the linearised loop"
             values = np.array([_loop_figure(design, name) for design in findings.judged])
             fresh[name] = Variable(values, ("family",), unit, label)

@@ -5,8 +5,9 @@ Everything is measured against the baseline, machine by machine and move by move
 - objective: sum of weight times the size of a metric (root of the mean square of its entries) over
   its size in the baseline's run of that scenario; of the scenarios, the mean of the worst share;
 - limits: the largest entry of a metric must not exceed the limit in any scenario; "baseline"
-  stands for the baseline's value there. `gain_margin` and `slowest_decay` are lower limits and
-  `spillover` an upper one of the linearised sampled loop at the first way-point;
+  stands for the baseline's value there. `gain_margin`, `slowest_decay` and the margins of
+  `jaxmodel.robustness` are lower limits, `spillover` and the peaks there upper ones, of the
+  linearised sampled loop at the first way-point;
   `singularity_distance` is a lower limit on the distance of all link angles from 0 and 90 deg.
 """
 
@@ -22,6 +23,7 @@ from pydantic import ValidationError
 
 from jaxmodel.laws import LAWS
 from jaxmodel.metrics import METRICS
+from jaxmodel.robustness import MARGINS, PEAKS
 from studies.engine.preflight import check_run
 from studies.errors import StudyError, field_error, nearest, shown, shown_name
 from studies.space.free import FreeNumbers
@@ -34,10 +36,12 @@ from studies.study.spec import OWN_FIELDS, Section, Study, described, parse_stud
 from studies.study.window import check_varied, with_window
 from studies.tuning.free import free_numbers, writes
 
-#: Limits that no run is needed for; all but `spillover` are lower ones. Those of the loop:
-OF_LOOP = ("gain_margin", "slowest_decay", "spillover")
+#: Limits that no run is needed for: those of the loop,
+OF_LOOP = ("gain_margin", "slowest_decay", "spillover", *MARGINS, *PEAKS)
 #: and with that of the mechanism.
 LOOP_LIMITS = (*OF_LOOP, "singularity_distance")
+#: Lower ones among them; the others are upper ones.
+LOWER = ("gain_margin", "slowest_decay", "singularity_distance", *MARGINS)
 #: Runs in one batch.
 MOST_RUNS = 50_000
 #: Limit that stands for the baseline's value.

@@ -1,0 +1,357 @@
+"""Margins and norms by frequency response against matrices of the loop, SciPy and brute force."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.optimize import brentq, minimize, minimize_scalar
+
+from jaxmodel.frequency_response import close_loop, command_gain, response_of_loop
+from jaxmodel.linear import linearise, resting
+from jaxmodel.prepare import prepare
+from jaxmodel.robustness import (
+    MARGINS,
+    MOST_DELAY,
+    PEAKS,
+    guaranteed_range,
+    robustness_figures,
+    search_frequencies,
+)
+from jaxmodel.sampled_loop import _with_electronics, closed_loop
+from jaxmodel.scaling import best_scaling, scaled
+from studies.engine.margins import judge_loops
+from studies.engine.robustness import judge_robustness
+from studies.engine.stability import with_margin_modes
+from studies.study.cases import as_arrays, build_case, build_cases, build_structure
+from studies.study.spec import paper_study
+
+#: Off home, where nothing is symmetric.
+POSE = np.array([0.005, -0.003, 0.5])
+STUDY = paper_study()
+PLANTS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "loaded basis under load": {"load__wrench": (3.0, -2.0, 0.1), "link__basis": "loaded"},
+    "electronics, two links": {
+        "electronics__sensor_highpass_hz": 2.0,
+        "electronics__amplifier_hz": 3000.0,
+        "control__links": (True, False, True),
+    },
+    "no reaction of bending": {"run__model": "ked"},
+}
+
+
+class Loop(NamedTuple):
+    """A loop by frequency response, and by its matrices."""
+
+    structure: Any
+    case: Any
+    response: Any
+    matrices: Any  # NumPy
+    period: float
+
+    @property
+    def commands(self) -> slice:
+        """Where the state holds the commands."""
+        return slice(len(self.matrices.open) - 3 * self.structure.n_patches, None)
+
+
+@partial(jax.jit, static_argnums=0)
+def _both(structure, case):
+    loop = prepare(structure, case).loop
+    return response_of_loop(structure, case, loop, POSE), closed_loop(structure, case, POSE)
+
+
+@cache
+def loop_of(name: str, law: str = "imsc", factor: float = 0.5) -> Loop:
+    study = STUDY.change(**PLANTS[name], control__law=law, control__gain_factor=factor)
+    structure, case = with_margin_modes(build_structure(study), as_arrays(build_case(study)))
+    response, matrices = _both(structure, case)
+    period = float(case.electronics.period)
+    return Loop(structure, case, response, jax.tree.map(np.asarray, matrices), period)
+
+
+_figures = jax.jit(robustness_figures, static_argnums=1)
+
+
+def exact_gain(loop: Loop, omega: float) -> np.ndarray:
+    """L by the matrices of the loop, opened where the controller writes its commands."""
+    m, at = loop.matrices, loop.commands
+    z = np.exp(1j * omega * loop.period)
+    states = np.linalg.solve(z * np.eye(len(m.open)) - m.open, np.eye(len(m.open))[:, at])
+    return -m.feedback[at] @ states
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_the_response_is_that_of_the_matrices(name):
+    loop = loop_of(name)
+    for hertz in (3.0, 114.4, 457.0, 2000.0, 4400.0):
+        omega = 2 * np.pi * hertz
+        found, wanted = command_gain(loop.response, omega), exact_gain(loop, omega)
+        np.testing.assert_allclose(found, wanted, atol=1e-6 * np.abs(wanted).max())
+
+
+def test_the_closed_loop_is_that_of_the_matrices():
+    loop = loop_of("electronics, two links")
+    m = loop.matrices
+    for hertz in (114.4, 900.0):
+        omega = 2 * np.pi * hertz
+        z = np.exp(1j * omega * loop.period)
+        closed = z * np.eye(len(m.open)) - m.open - m.feedback
+        wanted = m.deflection @ np.linalg.solve(closed, m.force)
+        found = close_loop(loop.response, omega)
+        scale = np.abs(wanted).max()
+        np.testing.assert_allclose(found.disturbance_deflection, wanted, atol=1e-6 * scale)
+        gain = exact_gain(loop, omega)
+        wanted = np.linalg.inv(np.eye(len(gain)) + gain)
+        np.testing.assert_allclose(found.sensitivity, wanted, atol=1e-6)
+
+
+def radius(matrix: np.ndarray) -> float:
+    return float(np.abs(np.linalg.eigvals(matrix)).max())
+
+
+def turned(loop: Loop, factor: complex) -> float:
+    """Spectral radius with all commands times a complex factor."""
+    return radius(loop.matrices.open + factor * loop.matrices.feedback)
+
+
+def delayed(loop: Loop, delay: float) -> float:
+    """Spectral radius with commands that arrive `delay` samples later, by exact discretisation."""
+    whole, share = divmod(delay, 1.0)
+    m, k = loop.matrices, 3 * loop.structure.n_patches
+    analogue = analogue_of(loop)
+    n, period = len(analogue.state), loop.period
+    both = np.zeros((n + k, n + k))
+    both[:n, :n], both[:n, n:] = analogue.state, np.asarray(analogue.enters)[:, :k]
+    early, late = expm(both * share * period), expm(both * (1 - share) * period)
+    size = len(m.open)
+    closed = np.zeros((size + (int(whole) + 1) * k,) * 2)
+    closed[:size, :size] = m.open + m.feedback
+    closed[:n] = 0
+    closed[:n, :n] = late[:n, :n] @ early[:n, :n]
+    # commands held now, one sample ago, ...
+    held = [slice(size - k, size)]
+    held += [slice(size + j * k, size + (j + 1) * k) for j in range(int(whole) + 1)]
+    closed[:n, held[int(whole) + 1]] += late[:n, :n] @ early[:n, n:]
+    closed[:n, held[int(whole)]] += late[:n, n:]
+    for before, after in pairwise(held):
+        closed[after, before] = np.eye(k)
+    return radius(closed)
+
+
+def analogue_of(loop: Loop) -> Any:
+    smooth = loop.structure._replace(is_smooth=True, feedback="sampled")
+
+    def matrices(case):
+        plant = linearise(smooth, prepare(smooth, case).loop, POSE, resting(smooth, case))
+        found = _with_electronics(smooth, plant, case)
+        return found.state, found.enters
+
+    if id(loop.matrices) not in _ANALOGUES:
+        state, enters = map(np.asarray, jax.jit(matrices)(loop.case))
+        _ANALOGUES[id(loop.matrices)] = _Analogue(state, enters)
+    return _ANALOGUES[id(loop.matrices)]
+
+
+class _Analogue(NamedTuple):
+    state: np.ndarray
+    enters: np.ndarray
+
+
+_ANALOGUES: dict[int, _Analogue] = {}
+
+#: Laws with gain factors at which their loops are stable.
+LOOPS = {"imsc": 0.5, "lqr": 0.5, "srf": 2e-4, "ppf": 0.5, "observer": 0.5, "lqg": 0.5}
+
+
+@pytest.mark.parametrize("law", LOOPS)
+def test_margins_are_where_a_pole_reaches_the_circle(law):
+    """Commands turned, or late by exact discretisation: stable before, at the edge there."""
+    loop = loop_of("plain", law, LOOPS[law])
+    found = {name: float(x) for name, x in _figures(loop.response, MARGINS).items()}
+    assert turned(loop, 1.0) < 1
+    edge = np.deg2rad(found["phase_margin"])
+    assert all(turned(loop, np.exp(1j * x)) < 1 for x in np.linspace(-0.9999, 0.9999, 12) * edge)
+    if edge < np.pi:
+        worst = max(turned(loop, np.exp(1j * sign * edge)) for sign in (1, -1))
+        assert worst == pytest.approx(1, abs=1e-8)
+    late = found["delay_margin"]
+    assert all(delayed(loop, x) < 1 for x in np.linspace(0, 0.9999, 8) * late)
+    if late < MOST_DELAY:
+        wanted = brentq(lambda x: delayed(loop, x) - 1, late * 0.99, late * 1.01, xtol=1e-12)
+        assert late == pytest.approx(wanted, rel=1e-6)
+
+
+def smallest_norm(matrix: np.ndarray) -> float:
+    """The best diagonal scaling by descent on Schatten norms of rising order."""
+    n = len(matrix)
+    y, best = np.zeros(n - 1), np.inf
+    for p in 4.0 ** np.arange(11):
+
+        def norm(y, p=p):
+            x = np.append(y, 0.0)
+            u, s, v = np.linalg.svd(matrix * np.exp(x[:, None] - x))
+            log = 2 * p * np.log(s)
+            weight = np.exp(log - log.max())
+            value = (log.max() + np.log(weight.sum())) / (2 * p)
+            weight /= weight.sum()
+            return value, (np.abs(u) ** 2 @ weight - weight @ np.abs(v) ** 2)[:-1]
+
+        y = minimize(norm, y, jac=True, method="BFGS", options={"gtol": 1e-12}).x
+        x = np.append(y, 0.0)
+        best = min(best, np.linalg.norm(matrix * np.exp(x[:, None] - x), 2))
+    return best
+
+
+def test_the_scaling_is_the_best_one():
+    rng = np.random.default_rng(1)
+    for n in (3, 9, 15):
+        matrix = rng.normal(size=(n, n)) + 1j * rng.normal(size=(n, n))
+        matrix *= np.exp(2 * rng.normal(size=(n, 1)))
+        found = jax.jit(best_scaling)(matrix)
+        assert float(found.bound) == pytest.approx(smallest_norm(matrix), rel=1e-6)
+        change = rng.normal(size=(n, n)) + 1j * rng.normal(size=(n, n))
+        ends = [float(best_scaling(matrix + h * change).bound) for h in (1e-5, -1e-5)]
+        slope = np.real(np.sum(np.conj(found.slope) * change))
+        assert slope == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-4)
+
+
+@pytest.mark.parametrize("law", ["imsc", "lqr"])
+def test_the_disk_margin_is_the_smallest_over_all_frequencies(law):
+    loop = loop_of("plain", law, LOOPS[law])
+    found = float(_figures(loop.response, MARGINS)["disk_margin"])
+
+    def excess(omega: float) -> np.ndarray:
+        gain = exact_gain(loop, omega)
+        return np.linalg.inv(np.eye(len(gain)) + gain) - np.eye(len(gain)) / 2
+
+    def balanced(omega: float) -> float:
+        return float(np.linalg.norm(np.asarray(_scaled(excess(omega))), 2))
+
+    omega = np.asarray(search_frequencies(loop.response))
+    rough = np.array([balanced(x) for x in omega])
+    peaks = np.argsort(-rough)[:12]
+    exact = {k: float(_best(excess(omega[k])).bound) for k in peaks}
+    assert 1 / found >= max(exact.values()) * (1 - 1e-9)
+    best = max(exact, key=lambda k: exact[k])
+    at = minimize_scalar(
+        lambda x: -float(_best(excess(x)).bound),
+        bounds=(omega[best - 1], omega[best + 1]),
+        method="bounded",
+        options={"xatol": 1e-7},
+    )
+    assert found == pytest.approx(-1 / at.fun, rel=1e-6)
+    assert smallest_norm(excess(at.x)) == pytest.approx(1 / found, rel=1e-6)
+
+
+_scaled, _best = jax.jit(scaled), jax.jit(best_scaling)
+
+
+def test_no_perturbation_inside_the_disk_breaks_the_loop():
+    """By the eigenvalues of the matrices with random errors of the actuators as large as it."""
+    loop, rng = loop_of("plain"), np.random.default_rng(2)
+    alpha = float(_figures(loop.response, MARGINS)["disk_margin"])
+    m, at = loop.matrices, loop.commands
+    count = 3 * loop.structure.n_patches
+
+    for _ in range(12):
+        delta = 0.999 * alpha * np.exp(2j * np.pi * rng.random(count))
+        closed = (m.open + m.feedback).astype(complex)
+        closed[at] *= ((1 + delta / 2) / (1 - delta / 2))[:, None]
+        assert radius(closed) < 1
+
+
+@pytest.mark.parametrize("name", PEAKS)
+def test_peaks_are_those_of_singular_values(name):
+    loop = loop_of("plain")
+    found = float(_figures(loop.response, PEAKS)[name])
+    field = name.removesuffix("_peak")
+
+    @jax.jit
+    def norm(omega):
+        matrix = getattr(close_loop(loop.response, omega), field)
+        return jnp.linalg.svd(matrix, compute_uv=False)[0]
+
+    hertz = np.geomspace(0.5, 4990, 3000)
+    values = np.array(jax.lax.map(norm, 2 * np.pi * hertz))
+    peak = hertz[values.argmax()]
+    best = minimize_scalar(
+        lambda x: -float(norm(2 * np.pi * x)),
+        bounds=(peak * 0.99, peak * 1.01),
+        method="bounded",
+        options={"xatol": 1e-9},
+    )
+    assert found == pytest.approx(-best.fun, rel=1e-6)
+
+
+def test_gradients_are_those_of_differences():
+    """By gains, drive, placement and delay of all figures."""
+    loop = loop_of("plain", "lqr", LOOPS["lqr"])
+    structure, case = loop.structure, jax.tree.map(jnp.asarray, loop.case)
+
+    def figures(x):
+        control = case.control._replace(gain_factor=case.control.gain_factor * x[0])
+        drive = case.drive._replace(kp=case.drive.kp * x[1])
+        patches = case.machine.patches
+        patches = patches._replace(center=patches.center * x[2])
+        changed = case._replace(
+            control=control, drive=drive, machine=case.machine._replace(patches=patches)
+        )
+        response = response_of_loop(structure, changed, prepare(structure, changed).loop, POSE)
+        found = robustness_figures(response, (*MARGINS, *PEAKS))
+        return jnp.log(jnp.stack([found[name] for name in (*MARGINS, *PEAKS)]))
+
+    both = jax.jit(lambda x: (figures(x), jax.jacrev(figures)(x)))
+    _, slope = both(jnp.ones(3))
+    step = 1e-5
+    for k, unit in enumerate(np.eye(3)):
+        high, low = (np.asarray(both(1 + sign * step * unit)[0]) for sign in (1, -1))
+        wanted = (high - low) / (2 * step)
+        np.testing.assert_allclose(slope[:, k], wanted, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("law", "patches", "links"),
+    [
+        ("imsc", 1, (True, False, False)),
+        ("srf", 5, (True, True, False)),
+        pytest.param("modified_imsc", 3, (True, True, True)),
+        pytest.param("lqg", 5, (False, True, True), marks=pytest.mark.long),
+        pytest.param("observer", 2, (True, True, True), marks=pytest.mark.long),
+    ],
+)
+def test_every_law_is_judged(law, patches, links):
+    """Through the sweep's judgement; margins of unstable loops are 0, peaks infinite."""
+    centers = np.linspace(0.2, 0.8, patches) * STUDY.link.length if patches > 1 else [0.1]
+    size = 0.5 * STUDY.link.length / 6
+    study = STUDY.change(
+        control__law=law,
+        control__links=links,
+        control__modes=min(patches, 2),
+        patches__centers=[list(map(float, centers))] * 3,
+        patches__actuator_length=size,
+        patches__sensor_length=size / 2,
+        control__ratios=[[1.0, 0.3][: min(patches, 2)]] * 3,
+    )
+    factors = np.array([0.0, 1e-3, 1e3])
+    structure = build_structure(study)
+    cases = build_cases(study, {"control.gain_factor": factors}, structure)
+    margin = judge_loops(structure, cases).gain_margin
+    found = judge_robustness(structure, cases, MARGINS, margin)
+    for name, most in zip(MARGINS, (2.0, 180.0, MOST_DELAY), strict=True):
+        assert found[name][0] == pytest.approx(most, rel=1e-6)
+        assert 0 < found[name][1] <= most * (1 + 1e-6)
+        assert found[name][2] == 0
+
+
+def test_what_a_disk_margin_guarantees():
+    gain, phase = guaranteed_range(np.array([0.0, 1.0, 2.0]))
+    np.testing.assert_allclose(gain, [0.0, 20 * np.log10(3.0), np.inf])
+    np.testing.assert_allclose(phase, [0.0, 2 * np.rad2deg(np.arctan(0.5)), 90.0])
