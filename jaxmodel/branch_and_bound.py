@@ -81,13 +81,14 @@ def exclude_zeros(
     return Search(_joined(left, cells), evaluated, True)
 
 
-def _judge(
-    setup: Exclusion, cells: Cells, smallest: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _judge(setup: Exclusion, cells: Cells, smallest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which cells are undecided, and along which coordinate to halve them; -1: none."""
     value = return_difference(setup, *cells)
     inverse = _inverse(value.mid)
-    is_open = ~(excludes_zero(value, inverse) < 1)
+    # half the sample rate is at another nu for every stiffness
+    nyquist = np.pi / float(setup.loop.period)
+    is_within = cells.low[:, 0] * np.sqrt(cells.low[:, 1]) <= nyquist
+    is_open = ~(excludes_zero(value, inverse) < 1) & is_within
     along = np.full(len(is_open), -1)
     at = np.flatnonzero(is_open)
     if not len(at):

@@ -11,12 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxmodel.parameters import Array
+
 
 class Disc(NamedTuple):
     """All z with |z - mid| <= rad, entry by entry; both arrays of one shape or broadcast."""
 
-    mid: np.ndarray
-    rad: np.ndarray
+    mid: Array
+    rad: Array
 
     def __add__(self, other: Disc) -> Disc:  # type: ignore[override]
         return Disc(self.mid + other.mid, self.rad + other.rad)
@@ -29,11 +31,11 @@ class Disc(NamedTuple):
         rad = np.abs(self.mid) @ other.rad + self.rad @ (np.abs(other.mid) + other.rad)
         return Disc(self.mid @ other.mid, rad)
 
-    def scaled(self, factor: np.ndarray) -> Disc:
+    def scaled(self, factor: Array) -> Disc:
         """Times exact numbers."""
         return Disc(self.mid * factor, self.rad * np.abs(factor))
 
-    def inverse(self, least: np.ndarray | None = None) -> Disc:
+    def inverse(self, least: Array | None = None) -> Disc:
         """Of the members, 1/z.
 
         Args:
@@ -52,7 +54,7 @@ class Disc(NamedTuple):
         return Disc(np.where(is_far, 0.0, mid), np.where(is_far, 1 / least, rad))
 
 
-def interval(low: np.ndarray, high: np.ndarray) -> Disc:
+def interval(low: Array, high: Array) -> Disc:
     """The disc over a real interval."""
     return Disc((low + high) / 2, (high - low) / 2)
 
@@ -62,7 +64,7 @@ def phase(angle: Disc) -> Disc:
     return Disc(np.exp(-1j * angle.mid), np.minimum(angle.rad, 2.0))
 
 
-def excludes_zero(matrix: Disc, inverse: np.ndarray | None = None) -> np.ndarray:
+def excludes_zero(matrix: Disc, inverse: Array | None = None) -> Array:
     """A number below 1 if no member of a disc of matrices is singular, (...).
 
     Members are F0 (1 + F0^-1 E) with |E| <= R entry by entry: nonsingular where the spectral radius
@@ -75,7 +77,8 @@ def excludes_zero(matrix: Disc, inverse: np.ndarray | None = None) -> np.ndarray
     """
     inverse = np.linalg.inv(matrix.mid) if inverse is None else inverse
     size = np.abs(inverse)
-    vector, least = np.ones((*size.shape[:-1], 1)), np.inf
+    vector = np.ones((*size.shape[:-1], 1))
+    least: Array = np.inf
     for _ in range(5):
         after = size @ (matrix.rad @ vector)
         ratio = np.max(after / vector, axis=(-2, -1))
@@ -104,3 +107,31 @@ def inverse_of(matrix: Disc) -> Disc:
     tail = norm / slack * np.max(second, axis=-2, keepdims=True)
     rad = np.where(is_clear, first + second + tail, np.inf)
     return Disc(mid, rad)
+
+
+def largest_over(tables: list[Array], omega: Disc, period: float) -> Array:
+    """Largest entries of a table by slices of [0, pi/T] over intervals of omega, (cells, ...).
+
+    Args:
+        tables: from `maxima_over_slices`.
+        omega: intervals [rad/s], (cells,).
+        period: T [s].
+    """
+    count = len(tables[0])
+    scale = count * period / np.pi
+    first = np.clip(((omega.mid - omega.rad) * scale).astype(int), 0, count - 1)
+    last = np.clip(((omega.mid + omega.rad) * scale).astype(int), 0, count - 1)
+    level = np.floor(np.log2(last - first + 1)).astype(int)
+    together = np.stack(tables)
+    return np.maximum(together[level, first], together[level, last + 1 - 2**level])
+
+
+def maxima_over_slices(table: Array) -> list[Array]:
+    """Maxima of a table over 1, 2, 4, ... slices from each one on, for `largest_over`."""
+    levels, width = [table], 1
+    while 2 * width <= len(table):
+        last, after = levels[-1], levels[-1].copy()
+        after[:-width] = np.maximum(last[:-width], last[width:])
+        levels.append(after)
+        width *= 2
+    return levels

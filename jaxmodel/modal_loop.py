@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, ControllerState, controller_step, rest_controller
+from jaxmodel.discs import Disc
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import patch_ends
@@ -155,3 +156,29 @@ def law_poles(law: tuple[np.ndarray, ...]) -> LawPoles:
     poles = LawPoles(pole, np.linalg.solve(vector, b.astype(complex)), c @ vector, d)
     used = (np.abs(poles.leave).sum(axis=0) > 0) & (np.abs(poles.enter).sum(axis=1) > 0)
     return LawPoles(pole[used], poles.enter[used], poles.leave[:, used], d)
+
+
+def law_response(law: LawPoles, omega: Disc, period: float) -> Disc:
+    """The law from (sensor voltages, applied voltages) to commands, (cells, U, 2 U).
+
+    A first-order change exactly, the second by the distance from the poles.
+
+    Args:
+        law: by partial fractions.
+        omega: intervals [rad/s], (cells,).
+        period: T [s].
+    """
+    z = np.exp(1j * omega.mid * period)
+    step = np.minimum(omega.rad * period, 2.0)
+    apart = z[:, None] - law.pole
+    distance = np.abs(apart)
+    slack = distance - step[:, None]
+    safe = np.where(slack > 0, slack, 1.0)
+    second = np.where(slack > 0, step[:, None] ** 2 / (distance**2 * safe), np.inf)
+    mid = (law.leave / apart[:, None]) @ law.enter + law.direct
+    slope = (law.leave / apart[:, None] ** 2) @ law.enter
+    used = np.where(np.isfinite(second), second, 0.0)
+    rad = np.abs(slope) * step[:, None, None]
+    rad = rad + (np.abs(law.leave) * used[:, None]) @ np.abs(law.enter)
+    is_lost = ~np.all(np.isfinite(second), axis=1)
+    return Disc(mid, np.where(is_lost[:, None, None], np.inf, rad))

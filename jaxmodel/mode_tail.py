@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.modal_loop import ModalLoop
+from jaxmodel.parameters import Array
 
 #: Bands of width 2 pi/T, one per image, that are bounded one by one.
 BANDS = 60
@@ -34,29 +35,29 @@ class Tail(NamedTuple):
     """
 
     # from command to sampled voltage, times E, chain included, by slices of omega, (slices, U, U)
-    images: np.ndarray
-    sensor: np.ndarray  # the rest at image 0, chain excluded: from voltage, (U, U)
-    sensor_by_pose: np.ndarray  # from pose, (U, 3)
-    pose_by_voltage: np.ndarray  # force on the pose from voltage, (3, U)
-    pose_by_pose: np.ndarray  # from pose, per nu^4, (3, 3)
+    images: Array
+    sensor: Array  # the rest at image 0, chain excluded: from voltage, (U, U)
+    sensor_by_pose: Array  # from pose, (U, 3)
+    pose_by_voltage: Array  # force on the pose from voltage, (3, U)
+    pose_by_pose: Array  # from pose, per nu^4, (3, 3)
 
 
 class _Sizes(NamedTuple):
     """Moduli of the modes' couplings, links and modes first; pose in coordinates of unit mass."""
 
-    sense: np.ndarray  # sensors per modal coordinate, (3, R, K)
-    pull: np.ndarray  # static answer to voltages, |actuator|/omega^2, (3, R, K)
-    enter: np.ndarray  # (3, R)
-    leave: np.ndarray  # (3, R)
+    sense: Array  # sensors per modal coordinate, (3, R, K)
+    pull: Array  # static answer to voltages, |actuator|/omega^2, (3, R, K)
+    enter: Array  # (3, R)
+    leave: Array  # (3, R)
     spring: float  # pose stiffness over mass [1/s2]
 
 
 class _Unknown(NamedTuple):
     """The same of modes j beyond those that are known one by one; closed forms of j."""
 
-    count: int  # J, modes that are known
-    sense: np.ndarray  # per j, (3, K)
-    pull: np.ndarray  # times j^3, (3, K)
+    known: int  # J, modes that are known
+    sense: Array  # per j, (3, K)
+    pull: Array  # times j^3, (3, K)
     enter: float  # times j
     leave: float  # times j
     omega: float  # over j^2, the smallest [rad/s]
@@ -116,9 +117,9 @@ def _one_image(
     unknown: _Unknown,
     span: tuple[float, float],
     stiffness: tuple[float, float],
-    high: np.ndarray,
+    high: Array,
     is_near: bool,
-) -> np.ndarray | None:
+) -> Array | None:
     """What is left out of one image over a span of |omega|, (U, U)."""
     at = _suprema(loop, *span, stiffness)
     seen = high * (at.remainder if loop.exact is not None else at.answer)
@@ -134,12 +135,12 @@ def _one_image(
 class _Band(NamedTuple):
     """Suprema over a band of omega and all stiffnesses, (3, R) each."""
 
-    answer: np.ndarray  # 1/|D|
-    inertial: np.ndarray  # x^2/|D|
-    remainder: np.ndarray  # |1/D - 1|
+    answer: Array  # 1/|D|
+    inertial: Array  # x^2/|D|
+    remainder: Array  # |1/D - 1|
 
 
-def least_denominator(square: np.ndarray, zeta: np.ndarray) -> np.ndarray:
+def least_denominator(square: Array, zeta: Array) -> Array:
     """Least |square - x^2 + 2 i zeta x| over all x."""
     sharp = np.minimum(zeta / np.sqrt(square), np.sqrt(0.5))
     return 2 * square * sharp * np.sqrt(1 - sharp**2)
@@ -171,7 +172,7 @@ def _chain(loop: ModalLoop, omega: float) -> float:
     return filtered * min(1.0, 2 / (omega * float(loop.period)))
 
 
-def pose_scale(loop: ModalLoop, payload: float) -> np.ndarray:
+def pose_scale(loop: ModalLoop, payload: float) -> Array:
     """C^-1 of the pose's mass C C' with a payload, (3, 3)."""
     return np.linalg.inv(np.linalg.cholesky(loop.mass + payload * loop.payload_mass))
 
@@ -200,7 +201,7 @@ def _unknown(loop: ModalLoop, payload: float) -> _Unknown:
     zeta = loop.zeta[:, -1]
     exist = float(np.any(loop.steepest[0]))
     return _Unknown(
-        count=count,
+        known=count,
         sense=np.asarray(loop.steepest[0]),
         pull=np.asarray(loop.steepest[1]) / first**2,
         enter=exist * float(np.max(sizes.enter * order)) * 3,  # three links
@@ -212,7 +213,7 @@ def _unknown(loop: ModalLoop, payload: float) -> _Unknown:
     )
 
 
-def _static_rest(loop: ModalLoop, base: int) -> np.ndarray:
+def _static_rest(loop: ModalLoop, base: int) -> Array:
     """Sizes of the static correction of `base` modes, (U, U)."""
     links, patches, _ = loop.sensor.shape
     if loop.exact is None:
@@ -220,7 +221,7 @@ def _static_rest(loop: ModalLoop, base: int) -> np.ndarray:
     return _on_diagonal(np.abs(static_rest(loop, base)))
 
 
-def static_rest(loop: ModalLoop, base: int) -> np.ndarray:
+def static_rest(loop: ModalLoop, base: int) -> Array:
     """Static voltages per voltage beyond `base` modes, (3, K, K); 0 without correction."""
     if loop.exact is None:
         links, patches, _ = loop.sensor.shape
@@ -232,7 +233,7 @@ def static_rest(loop: ModalLoop, base: int) -> np.ndarray:
     return np.asarray(loop.exact) - by_modes
 
 
-def _on_diagonal(blocks: np.ndarray) -> np.ndarray:
+def _on_diagonal(blocks: Array) -> Array:
     """Blocks (3, a, b) on a diagonal, (3 a, 3 b)."""
     n, a, b = blocks.shape
     whole = np.zeros((n, a, n, b))
@@ -240,7 +241,7 @@ def _on_diagonal(blocks: np.ndarray) -> np.ndarray:
     return whole.reshape(n * a, n * b)
 
 
-def _direct(sizes: _Sizes, seen: np.ndarray) -> np.ndarray:
+def _direct(sizes: _Sizes, seen: Array) -> Array:
     """Sum over modes from voltage to sensor, (U, U)."""
     return _on_diagonal(np.einsum("irk,ir,irl->ikl", sizes.sense, seen, sizes.pull))
 
@@ -252,17 +253,17 @@ def _through_pose(
     low: float,
     top: float,
     stiffness: tuple[float, float],
-    high: np.ndarray | None,
-) -> np.ndarray | None:
+    high: Array | None,
+) -> Array | None:
     """From voltage to pose to sensor in a band, (U, U); None: no bound.
 
     M p + sum enter q = 0, q = (pull u + x^2 leave p)/D: ||p|| <= f u/(1 - g), y <= h ||p||.
 
     Args:
-        high: 1 for modes that the model leaves out, if it has the rest: only what these change; None:
-            all modes.
+        high: 1 for modes that the model leaves out, if it has the rest: only what these change;
+            None: all modes.
     """
-    more = unknown.count
+    more = unknown.known
     stretch = (top / unknown.omega) ** 2 / stiffness[0]  # x^2 of mode j times j^4
     slack = 1 - stretch / more**4 - unknown.spring / stiffness[0]
     if unknown.leave > 0 and slack < 0.8:
@@ -293,17 +294,17 @@ def _beyond_bands(
     loop: ModalLoop,
     sizes: _Sizes,
     unknown: _Unknown,
-    static: np.ndarray,
-    rest: np.ndarray,
+    static: Array,
+    rest: Array,
     stiffness: tuple[float, float],
-) -> np.ndarray | None:
+) -> Array | None:
     """All images beyond `BANDS`, (U, U), known modes direct, all modes through the pose.
 
     At image n the unknown modes up to 2 j_n, j_n^2 = nu_n/omega_1, are taken to be resonant, those
     above answer by less than 4/3 x^2.
     """
     sampling = 2 * np.pi / float(loop.period)
-    low, more = (BANDS + 0.5) * sampling, unknown.count
+    low, more = (BANDS + 0.5) * sampling, unknown.known
     at = _suprema(loop, low, np.inf, stiffness)
     pushed = np.einsum("ir,ir,irk->ik", sizes.enter, at.answer, sizes.pull).ravel()
     pushed = pushed + unknown.enter * unknown.pull.ravel() * unknown.resonance / (3 * more**3)
@@ -323,9 +324,7 @@ def _beyond_bands(
     return cubes * (_direct(sizes, static + at.answer) + rest) + np.outer(seen, pushed) / slack
 
 
-def _unknown_images(
-    loop: ModalLoop, unknown: _Unknown, stiffness: tuple[float, float]
-) -> np.ndarray:
+def _unknown_images(loop: ModalLoop, unknown: _Unknown, stiffness: tuple[float, float]) -> Array:
     """Direct answers of unknown modes at all images but the first, (U, U).
 
     Images with x <= 1/2 by the remainder of mode J, which is the largest; those beyond by the
@@ -333,7 +332,7 @@ def _unknown_images(
     """
     sampling = 2 * np.pi / float(loop.period)
     root = np.sqrt(stiffness[0])
-    omega = unknown.omega * unknown.count**2
+    omega = unknown.omega * unknown.known**2
     weight = 4 * float(loop.antialias) ** 2 / (float(loop.period) * sampling**3)
     n = np.arange(1, 100_001)
     x = np.minimum((n + 0.5) * sampling / (root * omega), 0.5)
@@ -342,13 +341,13 @@ def _unknown_images(
     near += weight * 2 / (2 * (len(n) - 0.5) ** 2)
     turn = max(omega * root / (2 * sampling), 2.0)
     far = weight / (2 * (turn - 1.5) ** 2) * (1 + unknown.resonance) / 5
-    compliance = np.einsum("ik,il->ikl", unknown.sense, unknown.pull) / unknown.count
+    compliance = np.einsum("ik,il->ikl", unknown.sense, unknown.pull) / unknown.known
     return _on_diagonal(compliance) * (near + far)
 
 
 def _remainder(
-    loop: ModalLoop, unknown: _Unknown, x: np.ndarray, stiffness: tuple[float, float]
-) -> tuple[np.ndarray, np.ndarray]:
+    loop: ModalLoop, unknown: _Unknown, x: Array, stiffness: tuple[float, float]
+) -> tuple[Array, Array]:
     """Bounds of |D - 1| (or 1 without static correction) from above and |D| from below."""
     spring = unknown.spring / stiffness[0]
     size = 1 - x**2 - spring
@@ -361,12 +360,12 @@ def _with_first_image(
     loop: ModalLoop,
     unknown: _Unknown,
     first: _Band,
-    high: np.ndarray,
-    images: np.ndarray,
+    high: Array,
+    images: Array,
     payload: float,
     stiffness: tuple[float, float],
 ) -> Tail:
-    sizes, more = _sizes(loop, payload), unknown.count
+    sizes, more = _sizes(loop, payload), unknown.known
     scale = pose_scale(loop, payload)
     enter, leave = (np.abs(scale @ x) for x in (loop.enter, loop.leave))  # (3, 3, R)
     soft = high * first.answer / loop.omega**2

@@ -13,9 +13,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxmodel.discs import Disc, interval, inverse_of, phase
-from jaxmodel.modal_loop import LawPoles, ModalLoop, law_poles
+from jaxmodel.discs import (
+    Disc,
+    interval,
+    inverse_of,
+    largest_over,
+    maxima_over_slices,
+    phase,
+)
+from jaxmodel.modal_loop import LawPoles, ModalLoop, law_poles, law_response
 from jaxmodel.mode_tail import Tail, bound_tail, least_denominator, pose_scale, static_rest
+from jaxmodel.parameters import Array
 
 #: Images on either side whose direct responses are evaluated rather than bounded.
 NEAR = 2
@@ -33,9 +41,9 @@ class Exclusion(NamedTuple):
     tail: Tail  # sizes zero: the model's modes only
     base: int  # modes that are evaluated
     low: int  # of them, those that are unknowns of F
-    rest: np.ndarray  # static answer of the modes beyond the low ones, (3, K, K)
+    rest: Array  # static answer of the modes beyond the low ones, (3, K, K)
     payload: tuple[float, float]  # middle and half-width of the box [kg]
-    images: list[np.ndarray]  # of the tail, maxima over 1, 2, 4, ... slices
+    images: list[Array]  # of the tail, maxima over 1, 2, 4, ... slices
 
 
 def prepare_exclusion(
@@ -70,7 +78,7 @@ def prepare_exclusion(
     low = int(np.clip(np.sum(np.min(loop.omega, axis=0) < edge), 1, base))
     scale = pose_scale(loop, payload[0])
 
-    def reduced(x: np.ndarray) -> np.ndarray:
+    def reduced(x: Array) -> Array:
         return scale @ x @ scale.T
 
     scaled = loop._replace(
@@ -89,7 +97,7 @@ def prepare_exclusion(
         low=low,
         rest=static_rest(loop, low),
         payload=((payload[0] + payload[1]) / 2, (payload[1] - payload[0]) / 2),
-        images=_maxima(tail.images),
+        images=maxima_over_slices(tail.images),
     )
 
 
@@ -101,11 +109,11 @@ def _without_high(loop: ModalLoop, base: int) -> ModalLoop:
         actuator=loop.actuator * on[:, None],
         enter=loop.enter * on,
         leave=loop.leave * on,
-        steepest=tuple(0 * np.asarray(x) for x in loop.steepest),
+        steepest=(0 * loop.steepest[0], 0 * loop.steepest[1]),
     )
 
 
-def return_difference(setup: Exclusion, low: np.ndarray, high: np.ndarray) -> Disc:
+def return_difference(setup: Exclusion, low: Array, high: Array) -> Disc:
     """F over cells.
 
     Args:
@@ -120,14 +128,15 @@ def return_difference(setup: Exclusion, low: np.ndarray, high: np.ndarray) -> Di
     )
     root = interval(np.sqrt(low[:, 1]), np.sqrt(high[:, 1]))
     period = float(setup.loop.period)
-    ends = np.minimum([low[:, 0] * np.sqrt(low[:, 1]), high[:, 0] * np.sqrt(high[:, 1])],
-                      1.05 * np.pi / period)
+    ends = np.minimum(
+        [low[:, 0] * np.sqrt(low[:, 1]), high[:, 0] * np.sqrt(high[:, 1])], 1.05 * np.pi / period
+    )
     omega = interval(*ends)
     mechanical = _mechanics(setup, nu, stiffness, root, payload)
     chains = [_chain(setup.loop, omega, delay, image) for image in range(-NEAR, NEAR + 1)]
     by_voltage, by_pose, by_mode = _sensors(setup, nu, stiffness, root, omega, chains)
-    law = _law(setup, omega)
-    n, size = len(low), by_voltage.mid.shape[1]
+    law = law_response(setup.law, omega, period)
+    size = by_voltage.mid.shape[1]
     per_stiffness = stiffness.inverse()
     law_y = Disc(law.mid[:, :, :size], law.rad[:, :, :size])
     law_v = Disc(law.mid[:, :, size:], law.rad[:, :, size:])
@@ -139,7 +148,6 @@ def return_difference(setup: Exclusion, low: np.ndarray, high: np.ndarray) -> Di
     mid, rad = -row.mid, row.rad
     mid[:, :, -size:] += np.eye(size) - own.mid
     rad[:, :, -size:] += own.rad
-    del n
     return Disc(
         np.concatenate([mechanical.mid, mid], axis=1),
         np.concatenate([mechanical.rad, rad], axis=1),
@@ -192,9 +200,7 @@ def _resonance(
     return _Resonance(x2, denominator, denominator.inverse(least))
 
 
-def _mechanics(
-    setup: Exclusion, nu: Disc, stiffness: Disc, root: Disc, payload: Disc
-) -> Disc:
+def _mechanics(setup: Exclusion, nu: Disc, stiffness: Disc, root: Disc, payload: Disc) -> Disc:
     """Rows of the pose and of the low modes; columns: pose, low modes, commands."""
     loop, low, tail = setup.loop, setup.low, setup.tail
     links, patches, _ = loop.sensor.shape
@@ -202,23 +208,29 @@ def _mechanics(
     n = len(nu.mid)
     mid, rad = np.zeros((n, 3 + links * low, size), complex), np.zeros((n, 3 + links * low, size))
     nu2 = _lift(_square(nu))
-    mass = Disc(loop.mass + payload.mid[:, None, None] * loop.payload_mass,
-                payload.rad[:, None, None] * np.abs(loop.payload_mass))
+    mass = Disc(
+        loop.mass + payload.mid[:, None, None] * loop.payload_mass,
+        payload.rad[:, None, None] * np.abs(loop.payload_mass),
+    )
     softness = stiffness.inverse()
     ratio = nu * root.inverse()
-    pose = (mass * nu2).scaled(np.array(-1.0))
-    pose = pose + Disc(1j * ratio.mid[:, None, None] * loop.damping,
-                       ratio.rad[:, None, None] * np.abs(loop.damping))
-    pose = pose + Disc(softness.mid[:, None, None] * loop.stiffness,
-                       softness.rad[:, None, None] * np.abs(loop.stiffness))
+    pose = (mass * nu2).scaled(-1.0)
+    pose = pose + Disc(
+        1j * ratio.mid[:, None, None] * loop.damping,
+        ratio.rad[:, None, None] * np.abs(loop.damping),
+    )
+    pose = pose + Disc(
+        softness.mid[:, None, None] * loop.stiffness,
+        softness.rad[:, None, None] * np.abs(loop.stiffness),
+    )
     high = _resonance(setup, nu, stiffness, low, setup.base)
     enter, leave = loop.enter[:, :, low : setup.base], loop.leave[:, :, low : setup.base]
     pull = loop.actuator[:, low : setup.base] / loop.omega[:, low : setup.base, None] ** 2
     # M - sum enter x^2 leave/D of the modes above: what they add to the pose
     weigh = high.inverse * high.x2
-    pose = pose + _over_modes("ipr,cir,iqr->cpq", enter, weigh, leave) * nu2.scaled(np.array(-1.0))
+    pose = pose + _over_modes("ipr,cir,iqr->cpq", enter, weigh, leave) * nu2.scaled(-1.0)
     forced = _over_modes("ipr,cir,irk->cpik", enter, high.inverse, pull)
-    forced = Disc(*(x.reshape(n, 3, -1) for x in forced)) * nu2.scaled(np.array(-1.0))
+    forced = Disc(*(x.reshape(n, 3, -1) for x in forced)) * nu2.scaled(-1.0)
     reach = nu2.mid + nu2.rad
     mid[:, :3, :3], rad[:, :3, :3] = pose.mid, pose.rad + reach**2 * tail.pose_by_pose
     mid[:, :3, 3 + links * low :] = forced.mid
@@ -239,7 +251,7 @@ def _mechanics(
     return Disc(mid, rad)
 
 
-def _over_modes(path: str, one: np.ndarray, weight: Disc, other: np.ndarray) -> Disc:
+def _over_modes(path: str, one: Array, weight: Disc, other: Array) -> Disc:
     """Sum over modes of one weight other."""
     spread = np.broadcast_to(weight.mid, (len(weight.mid), len(one), weight.mid.shape[2]))
     rad = np.broadcast_to(weight.rad, spread.shape)
@@ -253,7 +265,7 @@ def _chain(loop: ModalLoop, omega: Disc, delay: Disc, image: int) -> Disc:
     """From command to voltage, and from sensor to converter, at one image, (cells,)."""
     period = float(loop.period)
     at = Disc(omega.mid + image * 2 * np.pi / period, omega.rad)
-    late = at * delay.scaled(np.array(period))
+    late = at * delay.scaled(period)
     late = Disc(late.mid + omega.mid * period, late.rad + omega.rad * period)
     if image == 0:
         half = omega.mid * period / 2
@@ -286,7 +298,7 @@ def _chain(loop: ModalLoop, omega: Disc, delay: Disc, image: int) -> Disc:
 def _sensors(
     setup: Exclusion, nu: Disc, stiffness: Disc, root: Disc, omega: Disc, chains: list[Disc]
 ) -> tuple[Disc, Disc, Disc]:
-    """Sampled voltages times E: from commands (cells, U, U), pose (., U, 3), low modes (., U, 3 J)."""
+    """Sampled voltages times E by commands, pose and low modes, (cells, U, U or 3 or 3 J)."""
     loop, tail, low, base = setup.loop, setup.tail, setup.low, setup.base
     links, patches, _ = loop.sensor.shape
     size, n = links * patches, len(nu.mid)
@@ -311,7 +323,7 @@ def _sensors(
     return direct, by_pose, first.scaled(seen)
 
 
-def _rest_of(setup: Exclusion, base: int) -> np.ndarray:
+def _rest_of(setup: Exclusion, base: int) -> Array:
     """Static answer beyond the base modes, (3, K, K)."""
     loop, modes = setup.loop, slice(setup.low, base)
     if loop.exact is None:
@@ -323,7 +335,7 @@ def _rest_of(setup: Exclusion, base: int) -> np.ndarray:
 
 
 def _near_images(
-    setup: Exclusion, omega: Disc, root: Disc, stiffness: Disc, chains: list[Disc], pull: np.ndarray
+    setup: Exclusion, omega: Disc, root: Disc, stiffness: Disc, chains: list[Disc], pull: Array
 ) -> Disc:
     """Near images, from commands to sampled voltages times E, (cells, U, U)."""
     loop, base = setup.loop, setup.base
@@ -347,7 +359,7 @@ def _near_images(
 
 
 def _through_pose(
-    setup: Exclusion, each: _Resonance, nu: Disc, root: Disc, stiffness: Disc, pull: np.ndarray
+    setup: Exclusion, each: _Resonance, nu: Disc, root: Disc, stiffness: Disc, pull: Array
 ) -> Disc:
     """From voltage to pose to sensor of the base modes, (cells, U, U).
 
@@ -359,43 +371,23 @@ def _through_pose(
     own = _over_modes("ipr,cir,iqr->cpq", enter, moved, leave)
     slowest = (nu.mid - nu.rad)[:, None, None]
     rigid = np.abs(loop.damping) / slowest / (root.mid - root.rad)[:, None, None]
-    rigid = rigid + np.abs(loop.stiffness) / slowest**2 / (stiffness.mid - stiffness.rad)[
-        :, None, None
-    ]
+    rigid = (
+        rigid + np.abs(loop.stiffness) / slowest**2 / (stiffness.mid - stiffness.rad)[:, None, None]
+    )
     middle, added = setup.payload
-    whole = Disc(own.mid + loop.mass + middle * loop.payload_mass,
-                 own.rad + rigid + added * np.abs(loop.payload_mass))
+    whole = Disc(
+        own.mid + loop.mass + middle * loop.payload_mass,
+        own.rad + rigid + added * np.abs(loop.payload_mass),
+    )
     pushed = _over_modes("ipr,cir,irk->cpik", enter, each.inverse, pull)
     seen = _over_modes("ikr,cir,ipr->cikp", loop.sensor[:, :, :base], moved, leave)
     pushed = Disc(*(x.reshape(n, 3, -1) for x in pushed))
     seen = Disc(*(x.reshape(n, -1, 3) for x in seen))
-    return (seen @ inverse_of(whole) @ pushed).scaled(np.array(-1.0))
-
-
-def largest_over(tables: list[np.ndarray], omega: Disc, period: float) -> np.ndarray:
-    """Largest entries of a table by slices of [0, pi/T] over intervals of omega, (cells, ...)."""
-    count = len(tables[0])
-    scale = count * period / np.pi
-    first = np.clip(((omega.mid - omega.rad) * scale).astype(int), 0, count - 1)
-    last = np.clip(((omega.mid + omega.rad) * scale).astype(int), 0, count - 1)
-    level = np.floor(np.log2(last - first + 1)).astype(int)
-    together = np.stack(tables)
-    return np.maximum(together[level, first], together[level, last + 1 - 2**level])
-
-
-def _maxima(table: np.ndarray) -> list[np.ndarray]:
-    """Maxima over 1, 2, 4, ... slices from each one on."""
-    levels, width = [table], 1
-    while 2 * width <= len(table):
-        last, after = levels[-1], levels[-1].copy()
-        after[:-width] = np.maximum(last[:-width], last[width:])
-        levels.append(after)
-        width *= 2
-    return levels
+    return (seen @ inverse_of(whole) @ pushed).scaled(-1.0)
 
 
 def _on_diagonal(blocks: Disc) -> Disc:
-    def whole(x: np.ndarray) -> np.ndarray:
+    def whole(x: Array) -> Array:
         n, links, a, b = x.shape
         full = np.zeros((n, links, a, links, b), x.dtype)
         for i in range(links):
@@ -403,25 +395,3 @@ def _on_diagonal(blocks: Disc) -> Disc:
         return full.reshape(n, links * a, links * b)
 
     return Disc(whole(blocks.mid), whole(blocks.rad))
-
-
-def _law(setup: Exclusion, omega: Disc) -> Disc:
-    """The law from (sensor voltages, applied voltages) to commands, (cells, U, 2 U).
-
-    A first-order change exactly, the second by the distance from the poles.
-    """
-    law, period = setup.law, float(setup.loop.period)
-    z = np.exp(1j * omega.mid * period)
-    step = np.minimum(omega.rad * period, 2.0)
-    apart = z[:, None] - law.pole
-    distance = np.abs(apart)
-    slack = distance - step[:, None]
-    safe = np.where(slack > 0, slack, 1.0)
-    second = np.where(slack > 0, step[:, None] ** 2 / (distance**2 * safe), np.inf)
-    mid = (law.leave / apart[:, None]) @ law.enter + law.direct
-    slope = (law.leave / apart[:, None] ** 2) @ law.enter
-    used = np.where(np.isfinite(second), second, 0.0)
-    rad = np.abs(slope) * step[:, None, None]
-    rad = rad + (np.abs(law.leave) * used[:, None]) @ np.abs(law.enter)
-    is_lost = ~np.all(np.isfinite(second), axis=1)
-    return Disc(mid, np.where(is_lost[:, None, None], np.inf, rad))

@@ -1,7 +1,10 @@
 """Proofs of stability: against eigenvalues of plants with 200 modes and of machines of the box."""
 
+import json
+
 import jax
 import jax.numpy as jnp
+import jsonschema
 import numpy as np
 import pytest
 
@@ -9,15 +12,37 @@ from jaxmodel import zero_exclusion
 from jaxmodel.branch_and_bound import Cells, exclude_zeros, start_cells
 from jaxmodel.controller import with_gains
 from jaxmodel.discs import Disc, excludes_zero, interval, inverse_of
-from jaxmodel.mode_tail import bound_tail
+from jaxmodel.mode_tail import bound_tail, static_rest
 from jaxmodel.sampled_loop import delayed_loop
 from jaxmodel.zero_exclusion import NEAR, prepare_exclusion, return_difference
 from studies.engine.controller import fixed_controller
-from studies.spillover.plants import LARGEST, LoopBuilder, PlantVariant, pad_channels, plant_structure
-from studies.spillover.proofs import BOX, KNOWN, SINES, collect, prove_box, volume
-from studies.study.spec import paper_study
-
-STUDY = paper_study().change(link__modes=3, motion__waypoints=paper_study().motion.waypoints[:2])
+from studies.engine.stability import gain_margin
+from studies.show.document import schema
+from studies.spillover import ModelMismatch, certify
+from studies.spillover.plants import (
+    LARGEST,
+    LoopBuilder,
+    PlantVariant,
+    pad_channels,
+    plant_structure,
+)
+from studies.spillover.proofs import (
+    BOX,
+    KNOWN,
+    SINES,
+    AllModes,
+    Proofs,
+    ProvenBox,
+    SpectralRadius,
+    collect,
+    proof_texts,
+    prove_all_modes,
+    prove_box,
+    volume,
+)
+from studies.spillover.report import document, report
+from tests.proofs import ONE_MOVE as STUDY
+from tests.proofs import many_modes_loop, random_design, spectral_radius
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +170,7 @@ def test_cells_contain_their_points(loop, wide):
 
 @pytest.mark.parametrize("has_correction", [True, False])
 def test_the_tail_covers_the_modes_left_out(design, law, has_correction):
-    """F of a base of 12 modes and its tail against F with 40, 90 and 200 modes of the same plant."""
+    """F with 12 modes and a tail against F with 40, 90 and 200 modes of the same plant."""
     loop = collect(design, law, SINES, KNOWN)
     if not has_correction:
         loop = loop._replace(exact=None)
@@ -157,18 +182,13 @@ def test_the_tail_covers_the_modes_left_out(design, law, has_correction):
     largest = 0.0
     for more in (40, 90, KNOWN):
         whole = prepare_exclusion(loop, more, *one, has_tail=False)
-        other = return_difference(whole._replace(low=setup.low, rest=_rest(loop, setup.low)), cell, cell)
+        whole = whole._replace(low=setup.low, rest=static_rest(loop, setup.low))
+        other = return_difference(whole, cell, cell)
         size = np.abs(other.mid - bound.mid)
         assert np.all(size <= bound.rad + other.rad + 1e-12 * np.abs(bound.mid))
         share = size / np.where(bound.rad > 0, bound.rad, np.inf)
         largest = max(largest, share[:, -9:, -9:].max())
     assert largest > 0.05  # the bound is not idle
-
-
-def _rest(loop, low):
-    from jaxmodel.mode_tail import static_rest
-
-    return static_rest(loop, low)
 
 
 def test_damping_that_falls_with_frequency_has_no_bound(loop):
@@ -178,8 +198,6 @@ def test_damping_that_falls_with_frequency_has_no_bound(loop):
 
 
 def test_nothing_is_proven_beyond_the_margin(design, law, loop):
-    from studies.engine.stability import gain_margin
-
     margin = gain_margin(LoopBuilder(design).loop(PlantVariant(SINES, LARGEST), law).poles)
     setup = prepare_exclusion(loop, LARGEST, (1.0, 1.0), (0.0, 0.0), has_tail=True)
     smallest = np.array([0.5, 1, 1, 1, 1e-3 * margin])
@@ -202,7 +220,7 @@ def test_the_volume_of_undecided_cells():
 
 
 def test_a_box_with_an_unstable_corner_is_not_proven(design):
-    """The difference estimator, unstable with seven modes; and gains beyond the margin with delay."""
+    """That of the difference estimator, which is unstable with seven modes."""
     study = STUDY.change(
         control__gain_factor=1.0,
         electronics__estimator="difference",
@@ -211,3 +229,83 @@ def test_a_box_with_an_unstable_corner_is_not_proven(design):
     other = fixed_controller(study)
     box = prove_box(other, pad_channels(other.controller, other.n_patches), 20.0)
     assert not box.is_proven and box.unstable is not None
+
+
+# --- designs --------------------------------------------------------------------------------------
+
+
+def judged(design, n_modes):
+    """Proven over true margin of a design, and the largest spectral radius up to the proven one."""
+    law = pad_channels(design.controller, design.n_patches)
+    found = prove_all_modes(design, law)
+    without, gains = many_modes_loop(design, n_modes)
+    radii = [spectral_radius(without + k * found.margin * gains) for k in (0.3, 0.7, 1.0)]
+    return found.margin / found.base_margin, max(radii)
+
+
+def test_what_is_proven_is_stable_with_many_modes(design):
+    share, radius = judged(design, 60)
+    assert radius < 1 and share > 0.9
+
+
+@pytest.mark.long  # in short: one design, and bounds of single entries
+def test_no_proven_design_is_unstable_with_200_modes():
+    found = np.array([judged(random_design(seed), KNOWN) for seed in range(1000, 2000)])
+    assert np.all(found[:, 1] < 1 + 1e-7)
+    assert np.median(found[:, 0]) > 0.9
+
+
+@pytest.mark.long  # in short: boxes that are not to be proven, and cells against their points
+def test_boxes_of_random_designs():
+    """No unstable machine in a proven box among samples; half of the boxes are proven."""
+    proven, rng = [], np.random.default_rng(0)
+    for seed in range(500, 520):
+        design = random_design(seed)
+        law = pad_channels(design.controller, design.n_patches)
+        box = prove_box(design, law, 60.0)
+        proven.append(box.is_proven)
+        if box.is_proven:
+            radius = SpectralRadius(design, law, design.study.link.basis)
+            machines = [[rng.uniform(*ends) for ends in BOX] for _ in range(2000)]
+            assert max(radius(*machine) for machine in machines) < 1 + 1e-7
+    assert sum(proven) >= 10
+
+
+# --- reports --------------------------------------------------------------------------------------
+
+PROVEN = Proofs(
+    AllModes(3.5, 3.7, LARGEST), ProvenBox(BOX, 0.0, True, LARGEST, cells=3282, seconds=4.0)
+)
+
+
+def test_statements_say_what_is_proven():
+    first, second = proof_texts(PROVEN)
+    assert first == (
+        "proven for every number of modes from 12 on: stable with all gains scaled by up to 3.5 "
+        "(12 modes alone: 3.7)"
+    )
+    assert second.startswith("proven: no unstable machine for stiffness of the links x 0.95 to")
+    texts = [
+        proof_texts(PROVEN._replace(box=PROVEN.box._replace(**changes)))[1]
+        for changes in (
+            {"undecided": 0.25},
+            {"undecided": 1.0, "unstable": (0.95, 1.0, 0.1)},
+            {"undecided": 1.0, "fault": "no bound"},
+        )
+    ]
+    assert texts[0].startswith("undecided on 25 % of the box")
+    assert texts[1].startswith("UNSTABLE machine in the box") and "x 0.95, 1 samples" in texts[1]
+    assert texts[2].endswith("no bound")
+    none = PROVEN._replace(all_modes=AllModes(0.0, 0.19, LARGEST, "no bound"))
+    assert proof_texts(none)[0] == "not proven for every number of modes: no bound"
+
+
+def test_certificates_hold_their_proofs():
+    found = certify(STUDY, sizes=(3,), bases=(SINES,), mismatches=(ModelMismatch(),))
+    for proofs in (None, PROVEN):
+        found = found._replace(proofs=proofs)
+        data = json.loads(document(found, None))
+        jsonschema.validate(data, schema("spillover"))
+        assert (data["proofs"] is None) == (proofs is None)
+        assert ("Proven: no unstable machine" in report(found, None)) == (proofs is not None)
+    assert data["proofs"]["box"]["is_proven"] and data["proofs"]["all_modes"]["gain_margin"] == 3.5

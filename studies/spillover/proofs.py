@@ -1,6 +1,6 @@
 """Proofs of stability: for every number of modes, and for a whole box of machines.
 
-Bounds and cells are those of `jaxmodel.zero_exclusion`; this module takes a design to them and back.
+Bounds and cells are those of `jaxmodel.zero_exclusion`; this module brings a design there and back.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from studies.spillover.plants import (
     pad_channels,
     plant_structure,
 )
+from studies.study.margin import margin_text
 
 #: Basis whose modes beyond the known ones are bounded in closed form.
 SINES = "pinned_pinned"
@@ -79,6 +80,46 @@ class Proofs(NamedTuple):
 
     all_modes: AllModes
     box: ProvenBox
+
+
+def proof_texts(proofs: Proofs) -> tuple[str, str]:
+    """What is proven, in a sentence each: for every number of modes, and for the box."""
+    modes = proofs.all_modes
+    if modes.margin > 0:
+        first = (
+            f"proven for every number of modes from {modes.n_base} on: stable with all gains "
+            f"scaled by up to {margin_text(modes.margin, 3)} ({modes.n_base} modes alone: "
+            f"{margin_text(modes.base_margin, 3)})"
+        )
+    else:
+        reason = modes.fault or "undecided already for small gains"
+        first = f"not proven for every number of modes: {reason}"
+    return first, _box_text(proofs.box)
+
+
+def _box_text(box: ProvenBox) -> str:
+    (low, high), (_, delay), (_, payload) = box.ranges
+    what = (
+        f"stiffness of the links x {low:g} to {high:g}, 0 to {delay:g} samples of extra delay, "
+        f"0 to {payload:g} kg more payload"
+    )
+    modes = (
+        f"every number of modes from {box.n_base} on"
+        if box.has_all_modes
+        else (f"{box.n_base} modes per link")
+    )
+    if box.fault:
+        return f"nothing proven for {what}: {box.fault}"
+    if box.unstable is not None:
+        e, d, m = box.unstable
+        return (
+            f"UNSTABLE machine in the box ({what}): stiffness x {e:.4g}, {d:.3g} samples of extra "
+            f"delay, {m:.3g} kg more payload"
+        )
+    if box.is_proven:
+        return f"proven: no unstable machine for {what} ({modes})"
+    share = max(100 * box.undecided, 1e-3)
+    return f"undecided on {share:.2g} % of the box ({what}; {modes}), proven on the rest"
 
 
 def prove(design: FixedController, seconds: float = 60.0) -> Proofs:
@@ -157,10 +198,10 @@ def prove_box(design: FixedController, law: Controller, seconds: float) -> Prove
         return nothing._replace(fault=f"{basis}: its modes move the far ends of the links")
     if design.structure.has_wrench and not has_tail:
         return nothing._replace(fault=f"{basis} under a steady load: its modes change")
-    radius = _Radius(design, law, basis)
+    radius = SpectralRadius(design, law, basis)
     corners = [(e, d, m) for e in BOX[0] for d in BOX[1] for m in BOX[2]]
-    middle = tuple(sum(ends) / 2 for ends in BOX)
-    for machine in (middle, *corners):
+    e, d, m = (sum(ends) / 2 for ends in BOX)
+    for machine in ((e, d, m), *corners):
         if radius(*machine) > 1 + RADIUS_TOLERANCE:
             return nothing._replace(unstable=machine)
     try:
@@ -183,11 +224,12 @@ def prove_box(design: FixedController, law: Controller, seconds: float) -> Prove
 
 
 def _counterexample(
-    cells: Cells, radius: _Radius, ranges: np.ndarray, most: int = 24
+    cells: Cells, radius: SpectralRadius, ranges: np.ndarray, most: int = 24
 ) -> tuple[float, float, float] | None:
     """An unstable machine in the middle of undecided cells, if one of a few is."""
-    at = np.unique(np.linspace(0, len(cells.low) - 1, most).astype(int)) if len(cells.low) else []
-    for k in at:
+    if not len(cells.low):
+        return None
+    for k in np.unique(np.linspace(0, len(cells.low) - 1, most).astype(int)):
         stiffness, delay, payload = (cells.low[k] + cells.high[k])[1:4] / 2
         machine = (float(stiffness), float(delay), float(payload - ranges[2, 0]))
         if radius(*machine) > 1 + RADIUS_TOLERANCE:
@@ -237,7 +279,7 @@ def _home(design: FixedController) -> np.ndarray:
     return np.array(design.study.motion.waypoints[0], float)
 
 
-class _Radius:
+class SpectralRadius:
     """Spectral radius of single machines of the box, by eigenvalues."""
 
     def __init__(self, design: FixedController, law: Controller, basis: str) -> None:
