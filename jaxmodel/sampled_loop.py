@@ -108,6 +108,43 @@ def loop_matrices(
     )
 
 
+def delayed_loop(
+    structure: Structure, case: Case, pose: Array, law: Controller, delay: Array
+) -> Array:
+    """Transition matrix of the closed loop whose commands come later still, (m, m).
+
+    Over the first part of a sample the actuators hold the command before the last one.
+
+    Args:
+        structure: static choices with feedback "sampled".
+        case: the numbers.
+        pose: where to linearise, at rest under the steady load [m, m, rad], (3,).
+        law: controller.
+        delay: beyond the one sample of computing, 0 to 1 [samples], ().
+    """
+    smooth = structure._replace(is_smooth=True, feedback="sampled")
+    loop = prepare(smooth, case).loop
+    plant = linearise(smooth, loop, pose, resting(structure, case))
+    analogue, period = _with_electronics(smooth, plant, case), case.electronics.period
+    earlier, later = (_over_a_sample(analogue, part * period) for part in (delay, 1 - delay))
+    from jax.flatten_util import ravel_pytree
+
+    n, n_sensors = len(earlier), 3 * structure.n_patches
+    rest, unpack = ravel_pytree(rest_controller(law))
+
+    def advance(x: Array) -> Array:
+        before, old = unpack(x[n:-n_sensors]), x[-n_sensors:]
+        held = jnp.ravel(before.voltage)
+        filtered = jnp.reshape(x[analogue.filtered], before.voltage.shape)
+        after, _ = controller_step(law, before, filtered, None, True)
+        moved = earlier[:, : n + n_sensors] @ jnp.concatenate([x[:n], old])
+        moved = later[:, : n + n_sensors] @ jnp.concatenate([moved, held])
+        return jnp.concatenate([moved, ravel_pytree(after)[0], held])
+
+    start = jnp.zeros((n + rest.size + n_sensors,), analogue.state.dtype)
+    return jax.jacfwd(advance)(start)
+
+
 class SampledPlant(NamedTuple):
     """What a controller acts on: x[k+1] = A x[k] + B u[k], y[k] = C x[k], over one sample.
 

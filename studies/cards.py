@@ -134,10 +134,12 @@ def _fit(fitted: Any) -> Card:
 def _certificate(certificate: Any) -> Card:
     """Of `certify` and `spillover_design`."""
     from studies.spillover.plots import margins
+    from studies.spillover.proofs import proof_texts
     from studies.spillover.report import damping_text, spillover_text, verdict
 
     texts = damping_text(certificate), spillover_text(certificate)
-    lines = [verdict(certificate), *texts, *certificate.notes]
+    proven = () if certificate.proofs is None else proof_texts(certificate.proofs)
+    lines = [verdict(certificate), *texts, *proven, *certificate.notes]
     least = np.argsort(np.where(certificate.exists, certificate.margin, np.inf), axis=None)
     rows = []
     for k in least[: min(MOST, certificate.exists.sum())]:

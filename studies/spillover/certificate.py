@@ -24,6 +24,7 @@ from studies.spillover.plants import (
     pad_channels,
     plant_sizes,
 )
+from studies.spillover.proofs import Proofs
 from studies.study.consistency import each_link
 from studies.study.spec import Study
 
@@ -63,6 +64,7 @@ class Certificate(NamedTuple):
     observation: np.ndarray  # channel signal per plant mode, (B, D, 3, C, R), see `SpilloverGains`
     actuation: np.ndarray  # modal force per channel force, (B, D, 3, R, C)
     notes: tuple[str, ...]  # what was left out, and why
+    proofs: Proofs | None = None  # beyond these plants, if they were asked for
 
     def _repr_html_(self) -> str:
         return shown(self)

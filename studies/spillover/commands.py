@@ -28,6 +28,13 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         margin: Annotated[
             float, typer.Option(help="gain margin required on every plant [1]; 2 is 6 dB")
         ] = 2.0,
+        prove: Annotated[
+            bool,
+            typer.Option(
+                "--prove",
+                help="also prove stability for every number of modes and a box of machines",
+            ),
+        ] = False,
         pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
     ) -> None:
         """Certify a controller on plants that differ from its model."""
@@ -38,5 +45,6 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.engine.design import load_design
         from studies.spillover.run import spillover_design
 
-        if not spillover_design(load_design(design, case), out, margin, console, pdf).is_passed:
+        certificate = spillover_design(load_design(design, case), out, margin, console, pdf, prove)
+        if not certificate.is_passed:
             sys.exit(1)

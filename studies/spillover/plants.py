@@ -136,27 +136,7 @@ class LoopBuilder:
     def _evaluate(
         self, plant: PlantVariant, law: Controller
     ) -> tuple[LoopMatrices, np.ndarray, SpilloverGains]:
-        nominal = self._design.structure
-        # drop everything only a controller's own design depends on: one program for all laws
-        structure = Structure(
-            n_modes=LARGEST,
-            n_controlled=nominal.n_controlled,
-            n_patches=nominal.n_patches,
-            n_steps=1,
-            n_frequencies=1,
-            basis=plant.basis,
-            has_shortening=nominal.has_shortening,
-            is_distributed=nominal.is_distributed,
-            has_static_correction=nominal.has_static_correction,
-            law=SRF.name,  # a channel for each patch, see `pad_channels`
-            has_feedforward=nominal.has_feedforward,
-            has_friction=nominal.has_friction,
-            has_position_gain=False,
-            is_coupled=nominal.is_coupled,
-            has_wrench=nominal.has_wrench,
-            has_sensor_highpass=nominal.has_sensor_highpass,
-            has_amplifier=nominal.has_amplifier,
-        )
+        structure = plant_structure(self._design, plant.basis, LARGEST)
         law = law._replace(feedback=law.feedback.without_rivals())  # linear: nothing switches
         law = jax.tree.map(jnp.asarray, law)
         return jax.tree.map(
@@ -178,6 +158,39 @@ class LoopBuilder:
             machine=machine._replace(patches=patches, beam=beam),
             n_modes=jnp.asarray(plant.n_modes),
         )
+
+
+def plant_structure(design: FixedController, basis: str, n_modes: int) -> Structure:
+    """Static choices of a plant under a design's controller.
+
+    They leave out everything that only a controller's own design depends on: one program for all
+    laws, which have a channel for each patch (`pad_channels`).
+
+    Args:
+        design: with its controller.
+        basis: of the plant.
+        n_modes: per link.
+    """
+    nominal = design.structure
+    return Structure(
+        n_modes=n_modes,
+        n_controlled=nominal.n_controlled,
+        n_patches=nominal.n_patches,
+        n_steps=1,
+        n_frequencies=1,
+        basis=basis,
+        has_shortening=nominal.has_shortening,
+        is_distributed=nominal.is_distributed,
+        has_static_correction=nominal.has_static_correction,
+        law=SRF.name,
+        has_feedforward=nominal.has_feedforward,
+        has_friction=nominal.has_friction,
+        has_position_gain=False,
+        is_coupled=nominal.is_coupled,
+        has_wrench=nominal.has_wrench,
+        has_sensor_highpass=nominal.has_sensor_highpass,
+        has_amplifier=nominal.has_amplifier,
+    )
 
 
 @kept_jit(static_argnums=0)

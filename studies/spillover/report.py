@@ -17,6 +17,7 @@ from studies.show.sketch import CAPTION
 from studies.spillover.certificate import Certificate, Spillover
 from studies.spillover.comparison import FAST, GIVEN, SHOWN, WINDOW, WITHOUT, Comparison
 from studies.spillover.plants import PlantVariant
+from studies.spillover.proofs import Proofs, proof_texts
 from studies.study.labels import describe
 from studies.study.margin import margin_text
 from studies.study.window import residual_delay
@@ -83,6 +84,7 @@ def report(certificate: Certificate, laws: Comparison | None, images: Path | Non
         residual=_residual(laws) if laws is not None else None,
         spillover=spillover_text(certificate),
         damping=damping_text(certificate),
+        proofs=proof_texts(certificate.proofs) if certificate.proofs is not None else (),
         margin=margin,
         worst=certificate.plants[certificate.worst],
         share=margin / certificate.required,
@@ -213,10 +215,40 @@ def document(certificate: Certificate, laws: Comparison | None) -> str:
         "fails_from_modes": certificate.fails_from or None,
         "notes": list(certificate.notes),
         "plants": [_plant(certificate, tuple(at)) for at in np.argwhere(certificate.exists)],
+        "proofs": certificate.proofs and _proofs(certificate.proofs),
         "laws": [] if laws is None else [_law(laws, k) for k in range(len(laws.names))],
         "study": certificate.study.model_dump(mode="json"),
     }
     return json_text("spillover", whole, version=2)
+
+
+def _proofs(proofs: Proofs) -> dict[str, Any]:
+    modes, box = proofs
+    unstable = None
+    if box.unstable is not None:
+        names = ("stiffness_factor", "extra_delay_samples", "more_payload_kg")
+        unstable = dict(zip(names, box.unstable, strict=True))
+    return {
+        "statements": list(proof_texts(proofs)),
+        "all_modes": {
+            "gain_margin": modes.margin,
+            "base_gain_margin": modes.base_margin,
+            "from_modes": modes.n_base,
+            "fault": modes.fault,
+        },
+        "box": {
+            "is_proven": box.is_proven,
+            "stiffness_factor": list(box.ranges[0]),
+            "extra_delay_samples": list(box.ranges[1]),
+            "more_payload_kg": list(box.ranges[2]),
+            "undecided_share": box.undecided,
+            "has_all_modes": box.has_all_modes,
+            "from_modes": box.n_base,
+            "cells": box.cells,
+            "unstable": unstable,
+            "fault": box.fault,
+        },
+    }
 
 
 def _spillover_entry(worst: Spillover) -> dict[str, Any]:

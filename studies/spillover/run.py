@@ -10,6 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from jaxmodel.laws import LAWS
+from studies.engine.controller import fixed_controller
 from studies.engine.design import Design
 from studies.engine.progress import Phases
 from studies.engine.run_data import run_attributes
@@ -22,6 +23,7 @@ from studies.show.sketch import sketch
 from studies.spillover import plots
 from studies.spillover.certificate import Certificate, certify
 from studies.spillover.comparison import Comparison, compare_laws
+from studies.spillover.proofs import proof_texts, prove
 from studies.spillover.report import damping_text, document, report, spillover_text, verdict
 from studies.store import Variable, write_store
 from studies.study.labels import STATUS_LABEL
@@ -37,6 +39,7 @@ def spillover_design(
     margin: float = 2.0,
     console: Console | None = None,
     has_pdf: bool = False,
+    has_proofs: bool = False,
 ) -> Certificate:
     """Write the certificate of a design, and the comparison of laws on its machine.
 
@@ -46,6 +49,8 @@ def spillover_design(
         margin: gain margin required on every plant [1].
         console: where messages go; default: standard output.
         has_pdf: also write the figures as PDF.
+        has_proofs: also prove stability for every number of modes and for a box of machines, where
+            that is possible within a minute or two.
 
     Returns:
         the certificate; `is_passed`: whether the design passes.
@@ -57,12 +62,19 @@ def spillover_design(
     check_folder(out)
     study = resolved_study(design.study)
     _check_owner(out, study)
-    with Phases(console, PHASES) as phases:
+    names = (PHASES[0], "prove", *PHASES[1:]) if has_proofs else PHASES
+    with Phases(console, names) as phases:
         phases.begin("judge", "the controller on plants that differ from its nominal model")
         certificate = certify(study, margin)
         console.print(verdict(certificate), soft_wrap=True)
         for text in filter(None, (damping_text(certificate), spillover_text(certificate))):
             console.print(text, soft_wrap=True)
+        if has_proofs:
+            phases.begin("prove", "every number of modes, and a box of machines")
+            proofs = prove(fixed_controller(study))
+            certificate = certificate._replace(proofs=proofs)
+            for text in proof_texts(proofs):
+                console.print(text, soft_wrap=True)
         phases.begin("compare laws")
         laws = None
         try:

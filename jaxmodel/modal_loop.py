@@ -1,0 +1,184 @@
+"""The sampled loop as modes, pose and controller, with its uncertain numbers kept apart.
+
+The stiffness of all links, an extra delay of the commands, the payload and a factor on all gains
+may vary over ranges; the controller's coefficients do not. `jaxmodel.zero_exclusion` reads it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.controller import Controller, ControllerState, controller_step, rest_controller
+from jaxmodel.discs import Disc
+from jaxmodel.lazy import jax, jnp
+from jaxmodel.parameters import Array
+from jaxmodel.piezo import patch_ends
+from jaxmodel.prepare import prepare
+from jaxmodel.return_difference import loop_response
+
+
+class ModalLoop(NamedTuple):
+    """One machine about rest with sine modes, and its controller; R modes a link, K patches.
+
+    Modal masses are 1. Of the law, x[k+1] = A x[k] + B (y, v)[k] and m[k] = C x[k] + D (y, v)[k]
+    with sensor voltages y, voltages on the actuators v[k+1] = m[k], 3 K each.
+    """
+
+    mass: Array  # of the pose without payload, (3, 3)
+    payload_mass: Array  # what each kilogram of payload adds to it [1/kg], (3, 3)
+    payload: Array  # of the study [kg], ()
+    damping: Array  # of the drive in the pose, (3, 3)
+    stiffness: Array  # (3, 3)
+    omega: Array  # of the modes without axial force [rad/s], (3, R)
+    spring: Array  # by axial forces, over omega^2 [1], (3, R)
+    zeta: Array  # damping ratios [1], (3, R)
+    exponent: Array  # p of zeta ~ omega^p beyond the R modes [1], ()
+    enter: Array  # force on the pose per modal acceleration, (3, 3, R)
+    leave: Array  # inertia force on a mode per pose acceleration, (3, 3, R)
+    sensor: Array  # sensor voltages per modal coordinate, (3, K, R)
+    actuator: Array  # on the modes per actuator voltage, (3, R, K)
+    # what |sensor| and |actuator| over the mode's number never exceed, (3, K) each
+    steepest: tuple[Array, Array]
+    exact: Array | None  # static voltage per voltage of all modes [V/V], (3, K, K); None: none left
+    law: tuple[Array, Array, Array, Array]  # A, B, C, D
+    period: Array  # T [s], ()
+    antialias: Array  # [rad/s], ()
+    highpass: Array | None  # [rad/s], None if there is none, ()
+    lag: Array | None  # of the amplifiers [s], None if there are none, ()
+
+
+def modal_loop(structure: Structure, case: Case, pose: Array, law: Controller) -> ModalLoop:
+    """Collect it.
+
+    Args:
+        structure: static choices with basis "pinned_pinned", law "srf" (a channel for each patch)
+            and as many modes as are to be known one by one.
+        case: the numbers.
+        pose: where to linearise, at rest under the steady load [m, m, rad], (3,).
+        law: the controller, without rival channels.
+
+    Returns:
+        ModalLoop.
+    """
+    loop = prepare(structure, case).loop
+    response = loop_response(structure, case, loop, pose)
+    masses = case.machine.masses
+    heavier = masses._replace(payload_mass=masses.payload_mass + 1.0)
+    other = case._replace(machine=case.machine._replace(masses=heavier))
+    more = loop_response(structure, other, prepare(structure, other).loop, pose).mass
+    square = loop.omega**2
+    exact = None
+    if loop.left_out is not None:
+        by_modes = jnp.einsum("ikr,irl->ikl", loop.sensor / square[:, None], loop.actuator)
+        exact = loop.left_out.sensor + by_modes
+    added = more - response.mass
+    return ModalLoop(
+        mass=response.mass - masses.payload_mass * added,
+        payload_mass=added,
+        payload=jnp.asarray(masses.payload_mass),
+        damping=response.damping,
+        stiffness=response.stiffness,
+        omega=loop.omega,
+        spring=response.square / square - 1,
+        zeta=response.decay / (2 * loop.omega),
+        exponent=jnp.asarray(case.machine.damping.exponent),
+        enter=response.enter,
+        leave=response.leave,
+        sensor=loop.sensor,
+        actuator=loop.actuator,
+        steepest=_steepest_slopes(case, loop.sensor, loop.actuator),
+        exact=exact,
+        law=_linear_law(law),
+        period=jnp.asarray(case.electronics.period),
+        antialias=jnp.asarray(case.electronics.antialias),
+        highpass=case.electronics.sensor_highpass if structure.has_sensor_highpass else None,
+        lag=case.electronics.amplifier_lag if structure.has_amplifier else None,
+    )
+
+
+def _steepest_slopes(case: Case, sensor: Array, actuator: Array) -> tuple[Array, Array]:
+    """2 pi lambda/L of sensors and actuators: the slope of sin(j pi x/L) is at most j pi/L."""
+    patches, length = case.machine.patches, jnp.asarray(case.machine.beam.length)
+    wave = jnp.arange(1, sensor.shape[2] + 1) * np.pi
+    length = jnp.broadcast_to(length, (len(sensor),))[:, None]
+
+    def steepest(response: Array, patch: Array) -> Array:
+        ends = patch_ends(jnp.asarray(patches.center), jnp.reshape(jnp.asarray(patch), (-1, 1)))
+        cosine = [jnp.cos(wave * (end / length)[:, :, None]) for end in ends]
+        slope = wave * (cosine[1] - cosine[0])
+        # both are one constant times the other
+        constant = jnp.sum(jnp.abs(response), axis=2) / jnp.sum(jnp.abs(slope), axis=2)
+        return 2 * np.pi * constant
+
+    by_patch = jnp.swapaxes(actuator, 1, 2)
+    return steepest(sensor, patches.sensor_length), steepest(by_patch, patches.actuator_length)
+
+
+def _linear_law(law: Controller) -> tuple[Array, Array, Array, Array]:
+    """A, B, C, D of a controller, see `ModalLoop`."""
+    from jax.flatten_util import ravel_pytree
+
+    rest, unpack = ravel_pytree(rest_controller(law).feedback)
+    applied = jnp.zeros(rest_controller(law).voltage.shape)
+    width = applied.size
+
+    def step(x: Array, ports: Array) -> tuple[Array, Array]:
+        measured, held = (jnp.reshape(part, applied.shape) for part in jnp.split(ports, 2))
+        after, info = controller_step(law, ControllerState(unpack(x), held), measured, None, True)
+        return ravel_pytree(after.feedback)[0], jnp.ravel(info.command)
+
+    (a, b), (c, d) = jax.jacfwd(step, (0, 1))(jnp.zeros_like(rest), jnp.zeros(2 * width))
+    return a, b, c, d
+
+
+class LawPoles(NamedTuple):
+    """A law by partial fractions: C (z - A)^-1 B + D = leave diag(1/(z - pole)) enter + D."""
+
+    pole: np.ndarray  # (n,)
+    enter: np.ndarray  # (n, 6 K)
+    leave: np.ndarray  # (3 K, n)
+    direct: np.ndarray  # (3 K, 6 K)
+
+
+def law_poles(law: tuple[np.ndarray, ...]) -> LawPoles:
+    """Partial fractions of A, B, C, D.
+
+    Raises:
+        ValueError: a law without a well-conditioned set of eigenvectors.
+    """
+    a, b, c, d = (np.asarray(x) for x in law)
+    pole, vector = np.linalg.eig(a)
+    if len(pole) and np.linalg.cond(vector) > 1e9:
+        raise ValueError("the controller has poles too close together for partial fractions")
+    poles = LawPoles(pole, np.linalg.solve(vector, b.astype(complex)), c @ vector, d)
+    used = (np.abs(poles.leave).sum(axis=0) > 0) & (np.abs(poles.enter).sum(axis=1) > 0)
+    return LawPoles(pole[used], poles.enter[used], poles.leave[:, used], d)
+
+
+def law_response(law: LawPoles, omega: Disc, period: float) -> Disc:
+    """The law from (sensor voltages, applied voltages) to commands, (cells, U, 2 U).
+
+    A first-order change exactly, the second by the distance from the poles.
+
+    Args:
+        law: by partial fractions.
+        omega: intervals [rad/s], (cells,).
+        period: T [s].
+    """
+    z = np.exp(1j * omega.mid * period)
+    step = np.minimum(omega.rad * period, 2.0)
+    apart = z[:, None] - law.pole
+    distance = np.abs(apart)
+    slack = distance - step[:, None]
+    safe = np.where(slack > 0, slack, 1.0)
+    second = np.where(slack > 0, step[:, None] ** 2 / (distance**2 * safe), np.inf)
+    mid = (law.leave / apart[:, None]) @ law.enter + law.direct
+    slope = (law.leave / apart[:, None] ** 2) @ law.enter
+    used = np.where(np.isfinite(second), second, 0.0)
+    rad = np.abs(slope) * step[:, None, None]
+    rad = rad + (np.abs(law.leave) * used[:, None]) @ np.abs(law.enter)
+    is_lost = ~np.all(np.isfinite(second), axis=1)
+    return Disc(mid, np.where(is_lost[:, None, None], np.inf, rad))

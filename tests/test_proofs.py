@@ -1,0 +1,311 @@
+"""Proofs of stability: against eigenvalues of plants with 200 modes and of machines of the box."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import jsonschema
+import numpy as np
+import pytest
+
+from jaxmodel import zero_exclusion
+from jaxmodel.branch_and_bound import Cells, exclude_zeros, start_cells
+from jaxmodel.controller import with_gains
+from jaxmodel.discs import Disc, excludes_zero, interval, inverse_of
+from jaxmodel.mode_tail import bound_tail, static_rest
+from jaxmodel.sampled_loop import delayed_loop
+from jaxmodel.zero_exclusion import NEAR, prepare_exclusion, return_difference
+from studies.engine.controller import fixed_controller
+from studies.engine.stability import gain_margin
+from studies.show.document import schema
+from studies.spillover import ModelMismatch, certify
+from studies.spillover.plants import (
+    LARGEST,
+    LoopBuilder,
+    PlantVariant,
+    pad_channels,
+    plant_structure,
+)
+from studies.spillover.proofs import (
+    BOX,
+    KNOWN,
+    SINES,
+    AllModes,
+    Proofs,
+    ProvenBox,
+    SpectralRadius,
+    collect,
+    proof_texts,
+    prove_all_modes,
+    prove_box,
+    volume,
+)
+from studies.spillover.report import document, report
+from tests.proofs import ONE_MOVE as STUDY
+from tests.proofs import many_modes_loop, random_design, spectral_radius
+
+
+@pytest.fixture(scope="module")
+def design():
+    return fixed_controller(STUDY)
+
+
+@pytest.fixture(scope="module")
+def law(design):
+    return pad_channels(design.controller, design.n_patches)
+
+
+@pytest.fixture(scope="module")
+def loop(design, law):
+    return collect(design, law, SINES, KNOWN)
+
+
+def box_cells(count, seed, wide):
+    """Cells of all shapes in the box and below twice the gains."""
+    rng = np.random.default_rng(seed)
+    ranges = np.array([(0.0, 3.1e4), *BOX, (0.0, 2.0)])
+    width = ranges[:, 1] - ranges[:, 0]
+    low = ranges[:, 0] + width * 0.9 * rng.uniform(size=(count, 5))
+    size = width * 10 ** rng.uniform(-5, -1, (count, 5)) * wide
+    return low, low + size
+
+
+# --- discs ----------------------------------------------------------------------------------------
+
+
+def test_discs_contain_the_results_of_their_members():
+    rng = np.random.default_rng(0)
+
+    def draw(*shape):
+        mid = rng.normal(size=shape) + 1j * rng.normal(size=shape)
+        return Disc(mid, 0.1 * rng.uniform(size=shape))
+
+    def member(x):
+        angle = rng.uniform(0, 2 * np.pi, x.mid.shape)
+        return x.mid + x.rad * np.exp(1j * angle)
+
+    a, b = draw(200, 3, 3), draw(200, 3, 3)
+    matrix = Disc(a.mid + 4 * np.eye(3), a.rad)
+    for _ in range(20):
+        one, other, third = member(a), member(b), member(matrix)
+        for bound, value in (
+            (a + b, one + other),
+            (a * b, one * other),
+            (a @ b, one @ other),
+            (a.inverse(), 1 / one),
+            (inverse_of(matrix), np.linalg.inv(third)),
+        ):
+            assert np.all(np.abs(value - bound.mid) <= bound.rad * (1 + 1e-12) + 1e-13)
+    assert np.isinf(Disc(np.array(0.1 + 0j), np.array(1.0)).inverse().rad)
+
+
+def test_a_disc_with_a_singular_member_is_not_excluded():
+    """diag(1, d) with d in [-r, 2 - r]: singular if and only if r >= 0."""
+    for r, is_excluded in ((-1e-6, True), (1e-6, False)):
+        span = interval(np.array(-r), np.array(2 - r))
+        mid = np.diag([1.0, span.mid]).astype(complex)
+        rad = np.diag([0.0, span.rad])
+        assert (excludes_zero(Disc(mid[None], rad[None]))[0] < 1) == is_excluded
+
+
+# --- the return difference ------------------------------------------------------------------------
+
+
+def test_the_return_difference_is_that_of_the_eigenvalue_problem(design, law, loop, monkeypatch):
+    """det F with and without gains, against det(z - A) of the exact discretisation.
+
+    Nearly all images evaluated; what is left out of the sum then falls as their number cubed.
+    """
+    monkeypatch.setattr(zero_exclusion, "NEAR", 12)
+    setup = prepare_exclusion(loop, LARGEST, BOX[0], BOX[2], has_tail=False)
+    structure = plant_structure(design, SINES, LARGEST)
+    case = design.case._replace(
+        initial=design.case.initial._replace(modal=np.zeros((3, LARGEST))),
+        n_modes=jnp.asarray(LARGEST),
+    )
+    pose = np.array(STUDY.motion.waypoints[0])
+    matrix = jax.jit(delayed_loop, static_argnums=0)
+    period, rng = float(loop.period), np.random.default_rng(1)
+    for _ in range(3):
+        stiffness, delay, payload = (rng.uniform(*ends) for ends in BOX)
+        machine = case.machine
+        changed = case._replace(
+            machine=machine._replace(
+                beam=machine.beam._replace(stiffness_factor=stiffness),
+                masses=machine.masses._replace(payload_mass=payload),
+            )
+        )
+        with_it, without = (
+            np.asarray(matrix(structure, changed, pose, with_gains(law, factor), delay))
+            for factor in (1.0, 0.0)
+        )
+        for hertz in (8.0, 113.0, 460.0, 1200.0, 2860.0, 4700.0):
+            z = np.exp(2j * np.pi * hertz * period)
+            eye = z * np.eye(len(with_it))
+            one, other = np.linalg.slogdet(eye - with_it), np.linalg.slogdet(eye - without)
+            wanted = one[0] / other[0] * np.exp(one[1] - other[1])
+            nu = 2 * np.pi * hertz / np.sqrt(stiffness)
+            cell = np.array([[nu, stiffness, delay, payload, gain] for gain in (1.0, 0.0)])
+            value = np.linalg.det(return_difference(setup, cell, cell).mid)
+            # images beyond the near ones are bounded, not evaluated
+            np.testing.assert_allclose(value[0] / value[1], wanted, rtol=2e-4)
+
+
+@pytest.mark.parametrize("wide", [1.0, 0.01])
+def test_cells_contain_their_points(loop, wide):
+    setup = prepare_exclusion(loop, LARGEST, BOX[0], BOX[2], has_tail=True)
+    low, high = box_cells(150, 2, wide)
+    cell, rng = return_difference(setup, low, high), np.random.default_rng(3)
+    for k in range(12):
+        share = rng.uniform(size=low.shape).round(0 if k % 2 else 8)
+        point = low + (high - low) * share
+        value = return_difference(setup, point, point)
+        # a point's own radius is the tail's, which both have
+        size = np.abs(value.mid - cell.mid) + value.rad
+        assert np.all(size <= cell.rad * (1 + 1e-9) + 1e-9 * (1 + np.abs(cell.mid)))
+
+
+# --- all modes ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("has_correction", [True, False])
+def test_the_tail_covers_the_modes_left_out(design, law, has_correction):
+    """F with 12 modes and a tail against F with 40, 90 and 200 modes of the same plant."""
+    loop = collect(design, law, SINES, KNOWN)
+    if not has_correction:
+        loop = loop._replace(exact=None)
+    one = (1.0, 1.0), (0.0, 0.0)
+    setup = prepare_exclusion(loop, LARGEST, *one, has_tail=True)
+    nu = np.linspace(10, 3.1e4, 400)
+    cell = np.stack([nu, *(np.full(400, x) for x in (1.0, 0.0, 0.0, 1.0))], axis=1)
+    bound = return_difference(setup, cell, cell)
+    largest = 0.0
+    for more in (40, 90, KNOWN):
+        whole = prepare_exclusion(loop, more, *one, has_tail=False)
+        whole = whole._replace(low=setup.low, rest=static_rest(loop, setup.low))
+        other = return_difference(whole, cell, cell)
+        size = np.abs(other.mid - bound.mid)
+        assert np.all(size <= bound.rad + other.rad + 1e-12 * np.abs(bound.mid))
+        share = size / np.where(bound.rad > 0, bound.rad, np.inf)
+        largest = max(largest, share[:, -9:, -9:].max())
+    assert largest > 0.05  # the bound is not idle
+
+
+def test_damping_that_falls_with_frequency_has_no_bound(loop):
+    assert bound_tail(loop._replace(exponent=-1.0), LARGEST, NEAR, (1.0, 1.0), 0.0) is None
+    with pytest.raises(ValueError, match="no bound of the modes"):
+        prepare_exclusion(loop._replace(exponent=-1.0), LARGEST, (1.0, 1.0), (0.0, 0.0), True)
+
+
+def test_nothing_is_proven_beyond_the_margin(design, law, loop):
+    margin = gain_margin(LoopBuilder(design).loop(PlantVariant(SINES, LARGEST), law).poles)
+    setup = prepare_exclusion(loop, LARGEST, (1.0, 1.0), (0.0, 0.0), has_tail=True)
+    smallest = np.array([0.5, 1, 1, 1, 1e-3 * margin])
+    for share, is_proven in ((0.9, True), (1.002, False)):
+        ranges = np.array([(1.0, 1.0), (0.0, 0.0), (0.0, 0.0), (0.8 * margin, share * margin)])
+        cells = start_cells(setup, ranges, 128)
+        found = exclude_zeros(setup, cells, smallest, 5000, stops_at_first=True)
+        assert (len(found.undecided.low) == 0) == is_proven
+
+
+# --- the box --------------------------------------------------------------------------------------
+
+
+def test_the_volume_of_undecided_cells():
+    ranges = np.array(BOX)
+    low = np.array([[10, 0.95, 0.0, 0.0, 1], [20, 0.95, 0.0, 0.0, 1], [30, 1.0, 0.5, 0.05, 1.0]])
+    high = np.array([[11, 1.0, 0.5, 0.1, 1], [21, 0.975, 0.5, 0.1, 1], [31, 1.05, 1, 0.1, 1.0]])
+    np.testing.assert_allclose(volume(Cells(low, high), ranges), 1 / 4 + 1 / 8)
+    assert volume(Cells(low[:0], high[:0]), ranges) == 0
+
+
+def test_a_box_with_an_unstable_corner_is_not_proven(design):
+    """That of the difference estimator, which is unstable with seven modes."""
+    study = STUDY.change(
+        control__gain_factor=1.0,
+        electronics__estimator="difference",
+        electronics__antialias_hz=1000.0,
+    )
+    other = fixed_controller(study)
+    box = prove_box(other, pad_channels(other.controller, other.n_patches), 20.0)
+    assert not box.is_proven and box.unstable is not None
+
+
+# --- designs --------------------------------------------------------------------------------------
+
+
+def judged(design, n_modes):
+    """Proven over true margin of a design, and the largest spectral radius up to the proven one."""
+    law = pad_channels(design.controller, design.n_patches)
+    found = prove_all_modes(design, law)
+    without, gains = many_modes_loop(design, n_modes)
+    radii = [spectral_radius(without + k * found.margin * gains) for k in (0.3, 0.7, 1.0)]
+    return found.margin / found.base_margin, max(radii)
+
+
+def test_what_is_proven_is_stable_with_many_modes(design):
+    share, radius = judged(design, 60)
+    assert radius < 1 and share > 0.9
+
+
+@pytest.mark.long  # in short: one design, and bounds of single entries
+def test_no_proven_design_is_unstable_with_200_modes():
+    found = np.array([judged(random_design(seed), KNOWN) for seed in range(1000, 2000)])
+    assert np.all(found[:, 1] < 1 + 1e-7)
+    assert np.median(found[:, 0]) > 0.9
+
+
+@pytest.mark.long  # in short: boxes that are not to be proven, and cells against their points
+def test_boxes_of_random_designs():
+    """No unstable machine in a proven box among samples; half of the boxes are proven."""
+    proven, rng = [], np.random.default_rng(0)
+    for seed in range(500, 520):
+        design = random_design(seed)
+        law = pad_channels(design.controller, design.n_patches)
+        box = prove_box(design, law, 60.0)
+        proven.append(box.is_proven)
+        if box.is_proven:
+            radius = SpectralRadius(design, law, design.study.link.basis)
+            machines = [[rng.uniform(*ends) for ends in BOX] for _ in range(2000)]
+            assert max(radius(*machine) for machine in machines) < 1 + 1e-7
+    assert sum(proven) >= 10
+
+
+# --- reports --------------------------------------------------------------------------------------
+
+PROVEN = Proofs(
+    AllModes(3.5, 3.7, LARGEST), ProvenBox(BOX, 0.0, True, LARGEST, cells=3282, seconds=4.0)
+)
+
+
+def test_statements_say_what_is_proven():
+    first, second = proof_texts(PROVEN)
+    assert first == (
+        "proven for every number of modes from 12 on: stable with all gains scaled by up to 3.5 "
+        "(12 modes alone: 3.7)"
+    )
+    assert second.startswith("proven: no unstable machine for stiffness of the links x 0.95 to")
+    texts = [
+        proof_texts(PROVEN._replace(box=PROVEN.box._replace(**changes)))[1]
+        for changes in (
+            {"undecided": 0.25},
+            {"undecided": 1.0, "unstable": (0.95, 1.0, 0.1)},
+            {"undecided": 1.0, "fault": "no bound"},
+        )
+    ]
+    assert texts[0].startswith("undecided on 25 % of the box")
+    assert texts[1].startswith("UNSTABLE machine in the box") and "x 0.95, 1 samples" in texts[1]
+    assert texts[2].endswith("no bound")
+    none = PROVEN._replace(all_modes=AllModes(0.0, 0.19, LARGEST, "no bound"))
+    assert proof_texts(none)[0] == "not proven for every number of modes: no bound"
+
+
+def test_certificates_hold_their_proofs():
+    found = certify(STUDY, sizes=(3,), bases=(SINES,), mismatches=(ModelMismatch(),))
+    for proofs in (None, PROVEN):
+        found = found._replace(proofs=proofs)
+        data = json.loads(document(found, None))
+        jsonschema.validate(data, schema("spillover"))
+        assert (data["proofs"] is None) == (proofs is None)
+        assert ("Proven: no unstable machine" in report(found, None)) == (proofs is not None)
+    assert data["proofs"]["box"]["is_proven"] and data["proofs"]["all_modes"]["gain_margin"] == 3.5
