@@ -16,6 +16,8 @@ import numpy as np
 from jaxmodel.axial import axial_force, chord_slopes
 from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
+from jaxmodel.drives import DRIVES
+from jaxmodel.drives.contract import drive_gains
 from jaxmodel.dynamics import mass_matrix, platform_mass
 from jaxmodel.estimator import Estimator
 from jaxmodel.kinematics import close_chain
@@ -59,7 +61,7 @@ class LoopResponse(NamedTuple):
 
 
 def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> LoopResponse:
-    """Collect what the return difference reads.
+    """Collect what the return difference reads; a sampled drive acts by its `drive_gains`.
 
     Args:
         structure: static choices with feedback "sampled".
@@ -97,10 +99,11 @@ def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
     leave = to_gamma[:, :, None] * at_c[:, None] - (
         (chain.sine[:, None] * to_rho)[:, :, None] * at_b[:, None]
     )
-    slope = drive.kd + drive.viscous_friction
+    gains = drive_gains(DRIVES[structure.drive], drive)
+    slope = gains.rate + drive.viscous_friction
     if structure.has_friction:
         slope = slope + drive.coulomb_friction / drive.friction_speed
-    stiffness = jnp.einsum("i,ip,iq->pq", drive.kp, to_rho, to_rho)
+    stiffness = jnp.einsum("i,ip,iq->pq", gains.position, to_rho, to_rho)
     modal_mass = plant.modal_mass[:, None]
     springs = None
     if structure.has_wrench:

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from jaxmodel.laws import LAWS
-from jaxmodel.laws.contract import Law, Parameter, acting_channels, modal_feedback
+from jaxmodel.laws.contract import Law, acting_channels, modal_feedback
 from jaxmodel.metrics import METRICS, Metric, is_real
-from jaxmodel.table import Table
+from jaxmodel.table import Parameter, Table
 from studies import config, sources
 from studies.cli import main
 from studies.engine.columns import PER_CASE

@@ -12,7 +12,7 @@ from __future__ import annotations
 from functools import reduce
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.laws.contract import Law, NominalModel, Parameter, acting_channels
+from jaxmodel.laws.contract import Law, NominalModel, acting_channels
 from jaxmodel.laws.link_model import (
     DAMPING,
     LinkModel,
@@ -25,6 +25,7 @@ from jaxmodel.laws.poles import closed_modes
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 from jaxmodel.state_space import StateSpace
+from jaxmodel.table import Parameter
 
 
 def corrections(structure: Structure, case: Case, nominal: NominalModel, state: Array) -> Array:
