@@ -94,7 +94,13 @@ def drive_code(exported: FixedController, name: str, origin: list[str]) -> Drive
         "memory": lines(update, "memory") if law.update else [],
     }
     files = (render(f"export/templates/drive.{end}", **values) for end in ("h", "c"))
-    return DriveCode(Source(*files), f"{name}_drive", drive, structure, period)
+    return DriveCode(
+        source=Source(*files),
+        name=f"{name}_drive",
+        drive=drive,
+        structure=structure,
+        period=period,
+    )
 
 
 @kept_jit(static_argnums=0)
@@ -243,7 +249,7 @@ def _respond(
 
 def _run(code: DriveCode, compiler: list[str], kind: type, *signals: np.ndarray) -> np.ndarray:
     """Feedback of the compiled drive after each sample, (n, 3)."""
-    inputs = [np.ascontiguousarray(x, kind) for x in signals]
+    inputs: list[np.ndarray] = [np.ascontiguousarray(x, kind) for x in signals]
     found = np.empty_like(inputs[0])
     with library(code.source, code.name, compiler, kind) as loaded:
         state = ctypes.create_string_buffer(6 * 8)
