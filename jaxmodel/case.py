@@ -32,7 +32,7 @@ class Structure(NamedTuple):
     controller_basis: str = "pinned_pinned"
     feedback: str = "sampled"  # "sampled", "ideal" or "none"
     law: str = "imsc"  # name in `jaxmodel.laws.LAWS`
-    has_feedforward: bool = False  # computed torque on top of PD
+    drive: str = "pd"  # name in `jaxmodel.drives.DRIVES`
     has_sensor_highpass: bool = False  # patches drained by their amplifiers' inputs
     has_amplifier: bool = False  # actuators behind amplifiers of finite bandwidth
     has_noise: bool = False  # seeded ADC noise and force ripple
@@ -108,6 +108,7 @@ class Drive(NamedTuple):
     pulse_start: Array  # [s], ()
     pulse_length: Array  # [s], ()
     is_locked: Array  # 1: sliders held (bases with Y(L) = 0), ()
+    parameters: dict[str, Array]  # the drive's own, by name
 
 
 class Load(NamedTuple):

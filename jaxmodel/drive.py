@@ -1,12 +1,14 @@
-"""Slider drive: PD on rho, optional computed torque, force limit, smooth friction, disturbances."""
+"""Forces along the guides: motors with their limit, smooth friction, disturbances."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from jaxmodel.case import Drive
+from jaxmodel.case import Drive, Structure
 from jaxmodel.controller import soft_limit
-from jaxmodel.lazy import jnp
+from jaxmodel.drives import DRIVES
+from jaxmodel.drives.contract import DriveState, SliderError
+from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 
 
@@ -15,45 +17,89 @@ class Reference(NamedTuple):
 
     rho: Array  # [m]
     rho_rate: Array  # [m/s]
-    feedforward: Array | None  # force added to PD: computed torque, or what holds a steady load [N]
+    feedforward: Array | None  # computed torque, or what holds a steady load [N]
     disturbance: Array  # external force, held over the sample [N]
     wrench: Array | None = None  # on the platform, held over the sample [N, N, N m]
+    # what a sampled drive feeds back, held over the sample [N]; None: the drive, or a sampled one
+    # to first order, acts in continuous time
+    held: Array | None = None
 
 
 def motor_force(
-    drive: Drive, reference: Reference, rho: Array, rho_rate: Array, is_smooth: bool
+    structure: Structure, drive: Drive, reference: Reference, rho: Array, rho_rate: Array
 ) -> Array:
-    """Force of the motors F = Kp (rho_d - rho) + Kd (rho_d' - rho') (+ feed-forward) [N], (3,).
+    """Force of the motors, feedback of the drive and feed-forward within their limit [N], (3,).
 
     Args:
-        drive: gains and limit, fields (3,) or ().
+        structure: static choices.
+        drive: numbers and limit, fields (3,) or ().
         reference: desired motion.
         rho: slider positions [m], (3,).
         rho_rate: [m/s], (3,).
-        is_smooth: limit with round corners, see `soft_limit`.
     """
-    force = drive.kp * (reference.rho - rho) + drive.kd * (reference.rho_rate - rho_rate)
+    force = reference.held
+    if force is None:
+        law, error = DRIVES[structure.drive], _error(reference, rho, rho_rate)
+        memory = None if law.update is None else jnp.zeros_like(rho)
+        force = law.force(drive, memory, error, structure.is_smooth)
     if reference.feedforward is not None:
         force = force + reference.feedforward
-    return soft_limit(force, drive.force_limit, is_smooth)
+    return soft_limit(force, drive.force_limit, structure.is_smooth)
+
+
+def _error(reference: Reference, rho: Array, rho_rate: Array) -> SliderError:
+    return SliderError(reference.rho - rho, reference.rho_rate - rho_rate)
 
 
 def slider_force(
-    drive: Drive,
-    reference: Reference,
-    rho: Array,
-    rho_rate: Array,
-    has_friction: bool,
-    is_smooth: bool,
+    structure: Structure, drive: Drive, reference: Reference, rho: Array, rho_rate: Array
 ) -> Array:
     """Force on the sliders [N], (3,): motors, friction F_c tanh(rho'/v) + c rho', disturbance.
 
     Args:
-        drive, reference, rho, rho_rate, is_smooth: as in `motor_force`.
-        has_friction: whether there is any Coulomb friction (tanh is costly).
+        structure, drive, reference, rho, rho_rate: as in `motor_force`; tanh is costly, so Coulomb
+            friction is left out where the structure has none.
     """
-    force = motor_force(drive, reference, rho, rho_rate, is_smooth) + reference.disturbance
+    force = motor_force(structure, drive, reference, rho, rho_rate) + reference.disturbance
     force = force - drive.viscous_friction * rho_rate
-    if has_friction:
+    if structure.has_friction:
         force = force - drive.coulomb_friction * jnp.tanh(rho_rate / drive.friction_speed)
     return force
+
+
+def drive_step(
+    structure: Structure,
+    drive: Drive,
+    period: Array,
+    state: DriveState,
+    reference: Reference,
+    rho: Array,
+    rho_rate: Array,
+    applied: Array,
+) -> DriveState:
+    """One sample of a sampled drive: what it feeds back during the next one, and its memory.
+
+    Args:
+        structure: static choices; in linear mechanics the law is taken to first order.
+        drive: its numbers.
+        period: of a sample [s], ().
+        state: force held over this sample, memory.
+        reference: desired motion at the sampling instant.
+        rho: slider positions there [m], (3,).
+        rho_rate: [m/s], (3,).
+        applied: feedback that acts during this sample, after the limit of the motors [N], (3,).
+    """
+    law = DRIVES[structure.drive]
+
+    def sample(memory: Array | None, error: SliderError, applied: Array) -> DriveState:
+        force = law.force(drive, memory, error, structure.is_smooth)
+        if law.update is None or memory is None:
+            return DriveState(force, memory)
+        return DriveState(force, law.update(drive, memory, error, applied, period))
+
+    inputs = (state.memory, _error(reference, rho, rho_rate), applied)
+    if not structure.is_linear:
+        return sample(*inputs)
+    rest = jax.tree.map(jnp.zeros_like, inputs)
+    change: DriveState = jax.jvp(sample, rest, inputs)[1]
+    return change

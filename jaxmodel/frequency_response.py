@@ -20,6 +20,8 @@ from jaxmodel.axial import axial_force, chord_slopes
 from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.controller import Controller
+from jaxmodel.drives import DRIVES
+from jaxmodel.drives.contract import drive_gains
 from jaxmodel.dynamics import mass_matrix, platform_mass
 from jaxmodel.electronics import FASTEST
 from jaxmodel.estimator import responses
@@ -69,7 +71,7 @@ def plant_response(structure: Structure, case: Case, loop: Loop, pose: Array) ->
         pose: where to linearise, at rest under the steady load [m, m, rad], (3,).
 
     Returns:
-        PlantResponse.
+        PlantResponse; a sampled drive acts in it by its `drive_gains`.
     """
     plant, drive, electronics = loop.plant, loop.drive, case.electronics
     pose = jnp.asarray(pose, loop.omega.dtype)
@@ -96,10 +98,11 @@ def plant_response(structure: Structure, case: Case, loop: Loop, pose: Array) ->
     leave = to_gamma[:, :, None] * at_c[:, None] - (
         (chain.sine[:, None] * to_rho)[:, :, None] * at_b[:, None]
     )
-    slope = drive.kd + drive.viscous_friction
+    gains = drive_gains(DRIVES[structure.drive], drive)
+    slope = gains.rate + drive.viscous_friction
     if structure.has_friction:
         slope = slope + drive.coulomb_friction / drive.friction_speed
-    stiffness = jnp.einsum("i,ip,iq->pq", drive.kp, to_rho, to_rho)
+    stiffness = jnp.einsum("i,ip,iq->pq", gains.position, to_rho, to_rho)
     modal_mass = plant.modal_mass[:, None]
     springs = None
     if structure.has_wrench:

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.drive import Reference, slider_force
+from jaxmodel.drives import DRIVES
 from jaxmodel.dynamics import inverse_dynamics, kinetic_energy, modal_chain
 from jaxmodel.kinematics import close_chain
 from jaxmodel.lazy import jax, jnp
@@ -32,6 +33,8 @@ class LinearPlant(NamedTuple):
     # what the actuators' voltages add at once to both, by the modes that are left out
     direct_deflection: Array  # [m/V], (3 S, 3 K)
     direct_sensor: Array  # [V/V], (3 K, 3 K)
+    # what a sampled drive reads: positions of the sliders [m], then their speeds [m/s], (6, n)
+    slider: Array | None = None
 
 
 def flatten(state: PlantState) -> Array:
@@ -62,7 +65,11 @@ def resting(structure: Structure, case: Case) -> Moment | None:
 
 
 def linearise(
-    structure: Structure, loop: Loop, pose: Array, moment: Moment | None = None
+    structure: Structure,
+    loop: Loop,
+    pose: Array,
+    moment: Moment | None = None,
+    is_held: bool = False,
 ) -> LinearPlant:
     """Linear plant at a pose; with ideal feedback in `structure` its loop is closed in A.
 
@@ -71,6 +78,8 @@ def linearise(
         loop: constants of the case.
         pose: (x, y, phi) [m, m, rad], (3,).
         moment: motion and load there, taken as lasting; None: at rest without load.
+        is_held: leave out the feedback of the sliders' drive, whose force is held; otherwise a
+            sampled drive acts by its `drive_gains`, in continuous time.
 
     Returns:
         LinearPlant.
@@ -81,13 +90,18 @@ def linearise(
     chain = close_chain(loop.plant, pose, rate)
     zero = jnp.zeros_like(loop.omega)
     rest = flatten(PlantState(pose, rate, zero, zero))
-    forward = still if structure.has_feedforward or structure.has_wrench else None
-    reference = Reference(chain.rho, chain.rho_rate, forward, still)
+    has_feedforward = DRIVES[structure.drive].has_feedforward or structure.has_wrench
+    reference = Reference(
+        rho=chain.rho,
+        rho_rate=chain.rho_rate,
+        feedforward=still if has_feedforward else None,
+        disturbance=still,
+        held=still if is_held else None,
+    )
     if moment is not None:
         held = inverse_dynamics(loop.plant, pose, rate, moment.acceleration, moment.wrench)
-        drive_force = slider_force(
-            loop.drive, reference, chain.rho, chain.rho_rate, structure.has_friction, True
-        )
+        smooth = structure._replace(is_smooth=True)
+        drive_force = slider_force(smooth, loop.drive, reference, chain.rho, chain.rho_rate)
         reference = reference._replace(disturbance=held - drive_force, wrench=moment.wrench)
 
     def derivative(x: Array, voltage: Array, force: Array) -> Array:
@@ -96,6 +110,14 @@ def linearise(
         rates = plant_rates(structure, loop, at, pushed, jnp.reshape(voltage, (3, -1)))
         moves = rates.acceleration
         return flatten(PlantState(at.pose_rate, moves.pose, at.q_rate, moves.modal))
+
+    def slider(x: Array) -> Array:
+        at = unflatten(x, structure.n_modes)
+        if structure.is_coupled:
+            moved = modal_chain(loop.plant, at.pose, at.pose_rate, at.q, at.q_rate)
+        else:
+            moved = close_chain(loop.plant, at.pose, at.pose_rate)
+        return jnp.concatenate([moved.rho, moved.rho_rate])
 
     n_voltages = 3 * structure.n_patches
     a, b_voltage, b_force = jax.jacfwd(derivative, (0, 1, 2))(
@@ -114,6 +136,7 @@ def linearise(
         sensor=_rows(loop.sensor, structure.n_modes),
         direct_deflection=direct_deflection,
         direct_sensor=direct_sensor,
+        slider=jax.jacfwd(slider)(rest) if is_held else None,
     )
 
 

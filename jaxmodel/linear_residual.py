@@ -10,6 +10,8 @@ from __future__ import annotations
 from functools import partial
 
 from jaxmodel.case import Case, Structure
+from jaxmodel.drives import DRIVES
+from jaxmodel.drives.contract import drive_gains
 from jaxmodel.dynamics import inverse_dynamics
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
@@ -34,8 +36,16 @@ def linear_residual(structure: Structure, case: Case, matrices: LoopMatrices) ->
     """
     start = begin(structure._replace(has_noise=False), case)
     inputs, drive = start.inputs, start.loop.drive
-    force = drive.kp * (jnp.mean(inputs.rho, axis=1) - inputs.rho[0, 0])
-    force = force + drive.kd * jnp.mean(inputs.rho_rate, axis=1)
+    home = inputs.rho[0, 0]
+    if matrices.reference is None:
+        gains = drive_gains(DRIVES[structure.drive], drive)
+        force = gains.position * (jnp.mean(inputs.rho, axis=1) - home)
+        force = force + gains.rate * jnp.mean(inputs.rho_rate, axis=1)
+        follow, seen = jnp.zeros((matrices.open.shape[0], 0)), inputs.rho[:, 0, :0]
+    else:  # a sampled drive reads its reference at the start of each sample
+        force = jnp.zeros_like(inputs.disturbance)
+        seen = jnp.concatenate([inputs.rho[:, 0] - home, inputs.rho_rate[:, 0]], axis=1)
+        follow = matrices.reference
     if structure.has_wrench:  # a pulse on the platform acts like slider forces that hold against it
         pulse = inputs.wrench - case.load.wrench
         still = jnp.zeros_like(start.state.plant.pose)
@@ -49,14 +59,15 @@ def linear_residual(structure: Structure, case: Case, matrices: LoopMatrices) ->
     is_before = inputs.window.time < begins - case.electronics.period / 2
     transition = matrices.open + matrices.feedback
 
-    def advance(x: Array, at: tuple[Array, Array]) -> tuple[Array, None]:
-        force, is_moving = at
-        return jnp.where(is_moving, transition @ x + matrices.force @ force, x), None
+    def advance(x: Array, at: tuple[Array, Array, Array]) -> tuple[Array, None]:
+        force, seen, is_moving = at
+        moved = transition @ x + matrices.force @ force + follow @ seen
+        return jnp.where(is_moving, moved, x), None
 
     still = jnp.zeros(transition.shape[0], transition.dtype)
-    x, _ = jax.lax.scan(advance, still, (force, is_before))
+    x, _ = jax.lax.scan(advance, still, (force, seen, is_before))
     # the machine comes to rest where the drive then holds it
-    held = matrices.force @ (force[-1] - inputs.disturbance[-1])
+    held = matrices.force @ (force[-1] - inputs.disturbance[-1]) + follow @ seen[-1]
     x = x - jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - transition, held)
     size = jnp.sqrt(jnp.sum(x * x))
     size = jnp.where(size > 0, size, 1.0)

@@ -20,7 +20,9 @@ from jaxmodel.controller import (
     rest_controller,
     soft_limit,
 )
-from jaxmodel.drive import Reference, motor_force, slider_force
+from jaxmodel.drive import Reference, drive_step, motor_force, slider_force
+from jaxmodel.drives import DRIVES
+from jaxmodel.drives.contract import DriveState, resting_drive
 from jaxmodel.dynamics import Accelerations, accelerations, modal_chain, shortening_row
 from jaxmodel.electronics import Amplifier
 from jaxmodel.integrator import Exponential
@@ -102,6 +104,7 @@ class State(NamedTuple):
     totals: metrics.Totals
     status: Array  # code of `jaxmodel.status`, as a float, ()
     bad_time: Array  # when the status appeared [s], 0 while OK, ()
+    drive: DriveState | None = None  # None: the drive is not sampled
 
 
 class Inputs(NamedTuple):
@@ -158,14 +161,7 @@ def plant_rates(
         chain = modal_chain(loop.plant, state.pose, state.pose_rate, state.q, state.q_rate)
     else:
         chain = close_chain(loop.plant, state.pose, state.pose_rate)
-    force = slider_force(
-        loop.drive,
-        reference,
-        chain.rho,
-        chain.rho_rate,
-        structure.has_friction,
-        structure.is_smooth,
-    )
+    force = slider_force(structure, loop.drive, reference, chain.rho, chain.rho_rate)
     if structure.feedback == "ideal":
         voltage = ideal_voltage(structure, loop, state.q, state.q_rate)
     piezo = jnp.sum(loop.actuator * voltage[:, None], axis=2)
@@ -396,11 +392,10 @@ def advance(
         (state at the next instant, Record of this one).
     """
     plant = state.plant
-    next_plant, rates = _advance_plant(structure, loop, plant, inputs, voltage)
-    reference = _reference(inputs, 0)
-    motors = motor_force(
-        loop.drive, reference, rates.chain.rho, rates.chain.rho_rate, structure.is_smooth
-    )
+    held = None if state.drive is None else state.drive.force
+    next_plant, rates = _advance_plant(structure, loop, plant, inputs, voltage, held)
+    reference, chain = _reference(inputs, 0, held), rates.chain
+    motors = motor_force(structure, loop.drive, reference, chain.rho, chain.rho_rate)
     present = voltage if plant.voltage is None else plant.voltage
     sample = _sample(loop, plant, inputs, voltage, present, clipped, motors, rates)
     fixed = metrics.Fixed(loop.omega, loop.modal_omega, loop.rotation, loop.settling_band)
@@ -409,7 +404,7 @@ def advance(
         time=inputs.window.time,
         pose=plant.pose,
         pose_error=sample.pose_error,
-        slider=rates.chain.rho,
+        slider=chain.rho,
         modal_coordinate=plant.q,
         controlled_coordinate=sample.modal,
         chord_deflection_stations=sample.deflection,
@@ -423,8 +418,33 @@ def advance(
         totals=totals,
         status=state.status,
         bad_time=state.bad_time,
+        drive=_next_drive(structure, loop, state.drive, reference, chain, motors),
     )
-    return _freeze_if_bad(structure, loop, state, proposed, rates.chain, inputs), record
+    return _freeze_if_bad(structure, loop, state, proposed, chain, inputs), record
+
+
+def _next_drive(
+    structure: Structure,
+    loop: Loop,
+    state: DriveState | None,
+    reference: Reference,
+    chain: Chain,
+    motors: Array,
+) -> DriveState | None:
+    """Next state of a sampled drive, which like the controller samples before the plant moves."""
+    if state is None:
+        return None
+    applied = motors if reference.feedforward is None else motors - reference.feedforward
+    return drive_step(
+        structure,
+        loop.drive,
+        structure.substeps * loop.plant_step,
+        state,
+        reference,
+        chain.rho,
+        chain.rho_rate,
+        state.force if structure.is_linear else applied,
+    )
 
 
 def deflection(loop: Loop, q: Array, voltage: Array) -> Array:
@@ -451,7 +471,7 @@ def _raw_voltage(loop: Loop, plant: PlantState, voltage: Array) -> Array:
     return seen + jnp.sum(loop.left_out.sensor * held[:, None], axis=2)
 
 
-def _reference(inputs: Inputs, point: int) -> Reference:
+def _reference(inputs: Inputs, point: int, held: Array | None) -> Reference:
     forward = None if inputs.feedforward is None else inputs.feedforward[point]
     return Reference(
         rho=inputs.rho[point],
@@ -459,15 +479,21 @@ def _reference(inputs: Inputs, point: int) -> Reference:
         feedforward=forward,
         disturbance=inputs.disturbance,
         wrench=inputs.wrench,
+        held=held,
     )
 
 
 def _advance_plant(
-    structure: Structure, loop: Loop, plant: PlantState, inputs: Inputs, voltage: Array
+    structure: Structure,
+    loop: Loop,
+    plant: PlantState,
+    inputs: Inputs,
+    voltage: Array,
+    held: Array | None,
 ) -> tuple[PlantState, Rates]:
     """All plant steps of one sample; held inputs stay constant. Returns the rates at its start."""
     if structure.substeps == 1:
-        start, middle, end = (_reference(inputs, k) for k in range(3))
+        start, middle, end = (_reference(inputs, k, held) for k in range(3))
         return plant_step(structure, loop, plant, (start, middle, end), voltage)
 
     def part(x: Array | None) -> Array | None:
@@ -484,6 +510,7 @@ def _advance_plant(
                 feedforward=None if forward is None else forward[k],
                 disturbance=inputs.disturbance,
                 wrench=inputs.wrench,
+                held=held,
             )
             for k in range(3)
         )
@@ -536,6 +563,8 @@ def _freeze_if_bad(
     total = jnp.sum(plant.pose + plant.pose_rate, axis=0)
     total = total + jnp.sum(jnp.sum(plant.q + plant.q_rate, axis=1), axis=0)
     total = total + jnp.sum(jnp.sum(new.controller.voltage, axis=1), axis=0)
+    for part in jax.tree.leaves(new.drive):
+        total = total + jnp.sum(part, axis=0)
     is_finite = jnp.abs(total) < jnp.inf  # false for NaN too
     # a linear machine's reach has no end
     is_linear = loop.rest is not None
@@ -596,4 +625,5 @@ def initial_state(
         totals=totals,
         status=code,
         bad_time=jnp.zeros_like(code),
+        drive=resting_drive(DRIVES[structure.drive], still),
     )

@@ -9,11 +9,13 @@ from jaxmodel import shaper, status
 from jaxmodel.axial import axial_compliance
 from jaxmodel.bases import Bases, find_bases
 from jaxmodel.beam import BASES, ModalBasis, pinned_free_roots
-from jaxmodel.case import Case, Structure
+from jaxmodel.case import Case, Drive, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.control import active_modes, condition_number, left_inverse
 from jaxmodel.controller import Controller, Feedback, with_gains
 from jaxmodel.drive import Reference
+from jaxmodel.drives import DRIVES
+from jaxmodel.drives.contract import drive_gains
 from jaxmodel.dynamics import inverse_dynamics
 from jaxmodel.electronics import design_amplifier, voltage_passage
 from jaxmodel.estimator import KINDS
@@ -112,12 +114,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         observer=jnp.einsum("ick,ikr->icr", design.nominal.observer, sensor),
         modal_omega=design.modal_omega,
         rotation=(jnp.cos(angle), jnp.sin(angle)),
-        drive=case.drive._replace(
-            **{
-                name: jnp.broadcast_to(jnp.asarray(getattr(case.drive, name)), (3,))
-                for name in _PER_LINK_DRIVE
-            }
-        ),
+        drive=_each_slider(case.drive),
         axial_compliance=axial_compliance(machine.beam),
         settling_band=jnp.asarray(case.windows.settling_band),
         left_out=_left_out(structure, case, basis, step),
@@ -170,7 +167,8 @@ def _rest(structure: Structure, case: Case, plant: Plant) -> Rest:
     still = jnp.zeros_like(pose)
     wrench = jnp.asarray(case.load.wrench) if structure.has_wrench else None
     force = None
-    if structure.has_feedforward or structure.has_wrench:
+    law = DRIVES[structure.drive]
+    if law.has_feedforward or structure.has_wrench:
         force = inverse_dynamics(plant, pose, still, still, wrench)
     held = Reference(
         rho=close_chain(plant, pose, still).rho,
@@ -178,6 +176,7 @@ def _rest(structure: Structure, case: Case, plant: Plant) -> Rest:
         feedforward=force,
         disturbance=still,
         wrench=wrench,
+        held=still if law.is_sampled else None,
     )
     return Rest(pose, held)
 
@@ -193,6 +192,17 @@ def _ideal(feedback: Feedback, sensor: Array) -> tuple[Array, Array | None]:
         return -jnp.einsum("ikc,icr->ikr", feedback.synthesizer, gain[:, :, None] * channel)
 
     return matrix(feedback.velocity_gain), matrix(feedback.position_gain)
+
+
+def _each_slider(drive: Drive) -> Drive:
+    """The drive with its numbers for each slider, (3,)."""
+
+    def each(x: Array) -> Array:
+        return jnp.broadcast_to(jnp.asarray(x), (3,))
+
+    parameters = {name: each(x) for name, x in drive.parameters.items()}
+    numbers = {name: each(getattr(drive, name)) for name in _PER_LINK_DRIVE}
+    return drive._replace(parameters=parameters, **numbers)
 
 
 _PER_LINK_DRIVE = (
@@ -332,6 +342,7 @@ def _static_status(
     is_used = jnp.arange(structure.n_modes) < case.n_modes
     mode_step, zeta = (jnp.where(is_used, x, 0.0) for x in (mode_step, zeta))
     patches, windows, control = case.machine.patches, case.windows, case.control
+    step = case.electronics.period / structure.substeps
     length = jnp.broadcast_to(case.machine.beam.length, (3,))
     is_off, is_overlapping = placement_faults(patches, length)
     checks = (
@@ -344,7 +355,7 @@ def _static_status(
             status.TOO_FAST,
         ),
         (
-            drive_rate(case) * case.electronics.period / structure.substeps > STIFFNESS_LIMIT,
+            drive_rate(structure.drive, case) * step > STIFFNESS_LIMIT,
             status.TOO_STIFF,
         ),
         (jnp.any(zeta >= 1), status.OVERDAMPED),
@@ -367,15 +378,23 @@ def _is_finite(case: Case) -> Array:
     return reduce(jnp.logical_and, (jnp.all(jnp.isfinite(leaf)) for leaf in numbers))
 
 
-def drive_rate(case: Case) -> Array:
+def drive_rate(kind: str, case: Case) -> Array:
     """Bound on the rate of the sliders' drive, d/m_s + sqrt(Kp/m_s) [1/s], ().
 
     d adds Kd, viscous friction and the steepest slope of the friction law; the mass that a slider
-    feels is at least its own. Locked sliders have none.
+    feels is at least its own. Locked sliders have none; of a sampled drive, whose force is held,
+    only friction remains. `kind` is a name in `DRIVES`.
     """
     drive, mass = case.drive, case.machine.masses.slider_mass
-    damping = drive.kd + drive.viscous_friction + drive.coulomb_friction / drive.friction_speed
-    rate = jnp.max(damping / mass + jnp.sqrt(drive.kp / mass))
+    damping = drive.viscous_friction + drive.coulomb_friction / drive.friction_speed
+    law = DRIVES[kind]
+    if law.is_sampled:
+        rate = jnp.max(damping / mass)
+    else:
+        gains = drive_gains(law, drive)
+        rate = jnp.max(
+            (gains.rate + damping) / mass + jnp.sqrt(jnp.maximum(gains.position, 0.0) / mass)
+        )
     return jnp.where(case.drive.is_locked > 0, 0.0, rate)
 
 

@@ -56,7 +56,7 @@ class LoopResponse(NamedTuple):
 
 
 def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> LoopResponse:
-    """Collect what the return difference reads.
+    """Collect what the return difference reads; a sampled drive acts by its `drive_gains`.
 
     Args:
         structure: static choices with feedback "sampled".

@@ -1,8 +1,9 @@
 """The linearised sampled loop: exact discretisation, spectral radius, modal damping, gain margin.
 
 Stability is judged here, never from a run: saturation keeps an unstable loop bounded. The plant
-with drive and electronics is discretised exactly for held commands; the controller is the loop's
-own `controller_step`, which is linear without rounding and limits.
+with electronics, and a drive in continuous time, is discretised exactly for held commands; the
+controller is the loop's own `controller_step`, which is linear without rounding and limits, and a
+sampled drive is the loop's own `drive_step` at rest.
 """
 
 from __future__ import annotations
@@ -13,6 +14,9 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, controller_step, rest_controller, with_gains
+from jaxmodel.drive import Reference, drive_step
+from jaxmodel.drives import DRIVES
+from jaxmodel.drives.contract import DriveState, resting_drive
 from jaxmodel.electronics import FASTEST
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.linear import LinearPlant, Moment, linearise, resting
@@ -27,14 +31,17 @@ RADIUS_TOLERANCE = 1e-7
 class LoopMatrices(NamedTuple):
     """Closed-loop transition matrix over one sample: open + factor * feedback.
 
-    The state is (X, X', q, q', electronics, controller).
+    The state is (X, X', q, q', electronics, controller, sampled drive).
     """
 
     open: Array  # all gains zero, (n, n)
     feedback: Array  # what the gains add, (n, n)
-    plant: Array  # A of the continuous uncontrolled plant, for its poles, (m, m)
+    plant: Array  # A of the continuous uncontrolled plant with drive, for its poles, (m, m)
     force: Array  # response to slider forces held over the sample, (n, 3)
     deflection: Array  # chord deflection at the stations [m], rows, (3 S, n)
+    # response of a sampled drive's state to the reference of the sliders, positions [m], then
+    # speeds [m/s], (n, 6); None: the drive acts in continuous time
+    reference: Array | None = None
 
 
 def closed_loop(
@@ -73,38 +80,77 @@ def loop_matrices(
 ) -> LoopMatrices:
     """`closed_loop` of a prepared case; moment None: at rest without load."""
     smooth = structure._replace(is_smooth=True, feedback="sampled")
-    plant = linearise(smooth, loop, pose, moment)
+    drive = DRIVES[structure.drive]
+    plant = linearise(smooth, loop, pose, moment, drive.is_sampled)
     analogue = _with_electronics(smooth, plant, case)
     exact = _over_a_sample(analogue, case.electronics.period)
     from jax.flatten_util import ravel_pytree
 
     n, n_sensors = len(exact), 3 * structure.n_patches
-    rest, unpack = ravel_pytree(rest_controller(law))
+    no_reference = jnp.zeros((6,), analogue.state.dtype)
+    rest, unpack = ravel_pytree((rest_controller(law), resting_drive(drive, no_reference[:3])))
 
-    def advance(x: Array, factor: Array) -> Array:
-        before = unpack(x[n:])
+    def advance(x: Array, factor: Array, reference: Array) -> Array:
+        before, servo = unpack(x[n:])
         filtered = jnp.reshape(x[analogue.filtered], before.voltage.shape)
         after, _ = controller_step(with_gains(law, factor), before, filtered, None, True)
-        moved = exact[:, : n + n_sensors] @ jnp.concatenate([x[:n], jnp.ravel(before.voltage)])
-        return jnp.concatenate([moved, ravel_pytree(after)[0]])
+        inputs = jnp.concatenate([x[:n], jnp.ravel(before.voltage)])
+        moved = _moved(exact, inputs, servo)
+        servo = _next_drive(smooth, case, loop, plant, x, servo, reference)
+        return jnp.concatenate([moved, ravel_pytree((after, servo))[0]])
 
     start = jnp.concatenate([jnp.zeros((n,), analogue.state.dtype), rest])
     jacobian = jax.jacfwd(advance)
-    without = jacobian(start, 0.0)
+    without = jacobian(start, 0.0, no_reference)
 
     def deflected(x: Array) -> Array:
         voltage = (
-            jnp.ravel(unpack(x[n:]).voltage) if analogue.voltage is None else x[analogue.voltage]
+            jnp.ravel(unpack(x[n:])[0].voltage) if analogue.voltage is None else x[analogue.voltage]
         )
         bent = plant.deflection @ x[: plant.deflection.shape[1]]
         return bent + plant.direct_deflection @ voltage
 
     return LoopMatrices(
         open=without,
-        feedback=jacobian(start, 1.0) - without,
-        plant=plant.state,
+        feedback=jacobian(start, 1.0, no_reference) - without,
+        plant=linearise(smooth, loop, pose, moment).state if drive.is_sampled else plant.state,
         force=jnp.pad(exact[:, n + n_sensors :], ((0, start.size - n), (0, 0))),
         deflection=jax.jacfwd(deflected)(start),
+        reference=jax.jacfwd(advance, 2)(start, 0.0, no_reference) if drive.is_sampled else None,
+    )
+
+
+def _moved(exact: Array, inputs: Array, servo: DriveState | None) -> Array:
+    """Analogue state one sample later, from state and voltages, and the force of the drive."""
+    if servo is None:
+        return exact[:, : inputs.size] @ inputs
+    return exact @ jnp.concatenate([inputs, servo.force])
+
+
+def _next_drive(
+    structure: Structure,
+    case: Case,
+    loop: Loop,
+    plant: LinearPlant,
+    x: Array,
+    servo: DriveState | None,
+    reference: Array,
+) -> DriveState | None:
+    """Next state of a sampled drive; x begins with the plant's state, all are deviations."""
+    if servo is None:
+        return None
+    assert plant.slider is not None
+    seen, still = plant.slider @ x[: plant.slider.shape[1]], jnp.zeros_like(servo.force)
+    wanted = Reference(reference[:3], reference[3:], None, still)
+    return drive_step(
+        structure._replace(is_linear=True),
+        loop.drive,
+        case.electronics.period,
+        servo,
+        wanted,
+        seen[:3],
+        seen[3:],
+        servo.force,
     )
 
 
@@ -150,7 +196,8 @@ class SampledPlant(NamedTuple):
 
     u are commands of the actuators [V], y what the converters see [V], link by link, patch by
     patch. Hold, amplifiers, anti-alias filter and the sample of computing delay are part of it; the
-    state is that of `LoopMatrices` without its controller, and last the commands that are held.
+    state is that of `LoopMatrices` without its controller, then a sampled drive, and last the
+    commands that are held.
     """
 
     state: Array  # A, (n, n)
@@ -170,18 +217,29 @@ def sampled_plant(structure: Structure, case: Case, pose: Array) -> SampledPlant
         SampledPlant.
     """
     smooth = structure._replace(is_smooth=True, feedback="sampled")
-    loop = prepare(smooth, case).loop
-    analogue = _with_electronics(
-        smooth, linearise(smooth, loop, pose, resting(structure, case)), case
-    )
+    loop, drive = prepare(smooth, case).loop, DRIVES[structure.drive]
+    plant = linearise(smooth, loop, pose, resting(structure, case), drive.is_sampled)
+    analogue = _with_electronics(smooth, plant, case)
     exact = _over_a_sample(analogue, case.electronics.period)
+    from jax.flatten_util import ravel_pytree
+
     n, n_sensors = len(exact), 3 * structure.n_patches
+    no_reference = jnp.zeros((6,), exact.dtype)
+    rest, unpack = ravel_pytree(resting_drive(drive, no_reference[:3]))
+    m = n + rest.size
     eye = jnp.eye(n_sensors, dtype=exact.dtype)
-    held = jnp.pad(exact[:, : n + n_sensors], ((0, n_sensors), (0, 0)))
+
+    def advance(x: Array) -> Array:
+        servo = unpack(x[n:m])
+        moved = _moved(exact, jnp.concatenate([x[:n], x[m:]]), servo)
+        servo = _next_drive(smooth, case, loop, plant, x, servo, no_reference)
+        return jnp.concatenate([moved, ravel_pytree(servo)[0]])
+
+    held = jax.jacfwd(advance)(jnp.zeros((m + n_sensors,), exact.dtype))
     return SampledPlant(
-        state=held,
-        enter=jnp.pad(eye, ((n, 0), (0, 0))),
-        leave=jnp.zeros((n_sensors, n + n_sensors), exact.dtype).at[:, analogue.filtered].set(eye),
+        state=jnp.pad(held, ((0, n_sensors), (0, 0))),
+        enter=jnp.pad(eye, ((m, 0), (0, 0))),
+        leave=jnp.zeros((n_sensors, m + n_sensors), exact.dtype).at[:, analogue.filtered].set(eye),
     )
 
 
@@ -390,7 +448,11 @@ def spillover(structure: Structure, case: Case, matrices: LoopMatrices) -> Array
         gramian = summed_squares(jax.lax.stop_gradient(transition).T, jnp.diag(outputs))
         return jnp.diagonal(gramian.share)[first:last], gramian
 
-    plant = matrices.open[: 6 + 6 * modes, : 6 + 6 * modes]
+    # the plant's states and those of a sampled drive; electronics do not act back on them
+    size, drive = matrices.open.shape[0], resting_drive(DRIVES[structure.drive], jnp.zeros((3,)))
+    count = sum(x.size for x in jax.tree.leaves(drive))
+    kept = np.r_[0 : 6 + 6 * modes, size - count : size]
+    plant = matrices.open[np.ix_(kept, kept)]
     loop = matrices.open + matrices.feedback
     (free_energy, free), (energy, closed) = ringing(plant), ringing(loop)
     ratio = jnp.where(is_left > 0, energy / jnp.where(is_left > 0, free_energy, 1.0), 0.0)

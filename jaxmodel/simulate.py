@@ -12,6 +12,7 @@ from jaxmodel import metrics, status
 from jaxmodel.axial import axial_force, critical_force, euler_force
 from jaxmodel.case import Case, Load, Structure
 from jaxmodel.controller import Controller
+from jaxmodel.drives import DRIVES
 from jaxmodel.dynamics import inverse_dynamics
 from jaxmodel.kinematics import inverse_kinematics, path_status, singularity_distance
 from jaxmodel.lazy import jax, jnp
@@ -72,7 +73,7 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
         sliders, torque = _about(sliders, rest.pose), _about(torque, rest.pose)
     rho, rho_rate = sliders(reference.position, reference.velocity)
     forward = None
-    if structure.has_feedforward:
+    if DRIVES[structure.drive].has_feedforward:
         forward = _points(jax.vmap(torque)(*reference), n)
     elif structure.has_wrench:  # the settled output of the drive's integrators
         still = jnp.zeros_like(reference.position[0])

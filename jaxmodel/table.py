@@ -3,11 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 
 class PartError(ValueError):
     """A part that violates its contract; the message says which and how."""
+
+
+class Parameter(NamedTuple):
+    """An entry's own field in the study file, `[control.laws.NAME]` or
+    `[drive.kinds.NAME]`; one number, or three."""
+
+    name: str
+    default: float
+    unit: str
+    text: str
+    low: float  # smallest value allowed
+    high: float
+
+
+def check_parameters(place: str, parameters: Iterable[Parameter]) -> None:
+    """Raise PartError for parameters that are invalid; `place` names their entry in messages."""
+    seen: set[str] = set()
+    for x in parameters:
+        if not isinstance(x, Parameter):
+            raise PartError(f"{place}: parameters: {x!r}; expected a Parameter")
+        if not x.name.isidentifier() or x.name in seen:
+            raise PartError(f"{place}: parameter {x.name!r}; expected a unique name")
+        if not x.low <= x.default <= x.high:
+            raise PartError(
+                f"{place}: parameter {x.name!r}: default {x.default:g}; "
+                f"allowed: {x.low:g} to {x.high:g}"
+            )
+        seen.add(x.name)
 
 
 class Named(Protocol):

@@ -1,6 +1,7 @@
-"""Your own laws, metrics, sweep methods and export targets, from one Python file.
+"""Your own laws, drives, metrics, sweep methods and export targets, from one Python file.
 
     laws = [Law("mine", ...)]
+    drives = [DriveLaw("mine", ...)]
     metrics = [Metric("pose_speed", ...)]
 
 `studies --with mine.py sweep ...` loads it, and so does `studies.extend("mine.py")`; a study file
@@ -21,6 +22,8 @@ from shlex import quote
 from types import ModuleType
 from typing import Any, cast
 
+from jaxmodel.drives import DRIVES
+from jaxmodel.drives.contract import DriveLaw
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law
 from jaxmodel.metrics import METRICS, Metric
@@ -31,6 +34,8 @@ from studies.errors import StudyError
 from studies.space.methods import METHODS, Method
 from studies.study.labels import RESERVED
 
+#: Lists that a file of one's own can have.
+KINDS = ("laws", "drives", "metrics", "methods", "targets")
 #: Where child processes find what was loaded, as paths or module names.
 VARIABLE = "FLEXLINK_WITH"
 
@@ -38,16 +43,17 @@ VARIABLE = "FLEXLINK_WITH"
 def extend(
     module: str | Path = "",
     laws: Iterable[Law] = (),
+    drives: Iterable[DriveLaw] = (),
     metrics: Iterable[Metric] = (),
     methods: Iterable[Method] = (),
     targets: Iterable[Any] = (),
 ) -> None:
-    """Load laws, metrics, sweep methods and export targets; loading them again changes nothing.
+    """Load laws, drives, metrics, methods and targets; loading them again changes nothing.
 
     Args:
-        module: Python file (`*.py`) or importable module with lists `laws`, `metrics`, `methods`,
-            `targets`; "" for none.
-        laws, metrics, methods, targets: further ones.
+        module: Python file (`*.py`) or importable module with lists `laws`, `drives`, `metrics`,
+            `methods` (of sweeps), `targets` (of exports); "" for none.
+        laws, drives, metrics, methods, targets: further ones.
 
     Raises:
         StudyError: no such module, one that fails or is empty, or a name already taken.
@@ -56,6 +62,7 @@ def extend(
     plugin = _imported(str(module)) if str(module) else None
     for kind, added in (
         ("laws", laws),
+        ("drives", drives),
         ("metrics", metrics),
         ("methods", methods),
         ("targets", targets),
@@ -73,8 +80,8 @@ def extend(
                 raise StudyError(f"{module or 'extend'}: {error}") from None
     if plugin is None:
         return
-    if not any(hasattr(plugin, kind) for kind in ("laws", "metrics", "methods", "targets")):
-        raise StudyError(f"{module}: has none of the lists laws, metrics, methods, targets")
+    if not any(hasattr(plugin, kind) for kind in KINDS):
+        raise StudyError(f"{module}: has none of the lists {', '.join(KINDS)}")
     file = Path(str(plugin.__file__)).resolve()
     stop_keeping_programs()
     for own in dict.fromkeys([file, *_sources_of(set(sys.modules) - before)]):
@@ -126,7 +133,12 @@ def _requested_modules() -> list[str]:
 def _table(kind: str) -> Table[Any]:
     if kind == "targets":  # a higher layer, whose templates and compilers only exports need
         return cast("Table[Any]", importlib.import_module("studies.export.targets").TARGETS)
-    tables: dict[str, Table[Any]] = {"laws": LAWS, "metrics": METRICS, "methods": METHODS}
+    tables: dict[str, Table[Any]] = {
+        "laws": LAWS,
+        "drives": DRIVES,
+        "metrics": METRICS,
+        "methods": METHODS,
+    }
     return tables[kind]
 
 

@@ -12,10 +12,11 @@ import jax
 import numpy as np
 import pytest
 
+from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
-from jaxmodel.laws.contract import Law, Parameter, acting_channels, modal_feedback
+from jaxmodel.laws.contract import Law, acting_channels, modal_feedback
 from jaxmodel.metrics import METRICS, Metric, is_real
-from jaxmodel.table import Table
+from jaxmodel.table import Parameter, Table
 from studies import config, sources
 from studies.cli import main
 from studies.engine.columns import PER_CASE
@@ -90,7 +91,7 @@ def own(tmp_path_factory):
 def taken_in(file, text):
     """A file of parts while its tables hold them; afterwards they are as before."""
     file.write_text(text)
-    tables = (LAWS, METRICS, METHODS, TARGETS)
+    tables = (LAWS, DRIVES, METRICS, METHODS, TARGETS)
     before = [dict(table._entries) for table in tables]
     extend(file)
     extend(file)  # again: nothing happens
@@ -165,6 +166,18 @@ def test_own_law_and_metric_in_a_single_run(own):
     )
     assert weak.loop.damping_ratio[0].max() < strong.loop.damping_ratio[0].max()
     assert 0 < float(weak.result.metrics.turning) != float(strong.result.metrics.turning)
+
+
+def test_own_drive_in_a_single_run(own):
+    """Stiffer than PD where its errors are large, 0.1 mm."""
+    study = parse_study(tomllib.loads(OWN))
+    peak = [
+        run_study(
+            study.change(drive__kind=kind), has_record=False, has_loop=False
+        ).result.metrics.pose_error_peak[1]
+        for kind in ("pd", "stiffening")
+    ]
+    assert peak[1] < 0.99 * peak[0]
 
 
 def test_own_parts_in_a_sweep(own, tmp_path, capsys):

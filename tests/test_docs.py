@@ -11,6 +11,7 @@ import pytest
 import typer
 
 import studies
+from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
 from jaxmodel.metrics import METRICS
 from studies.cli import app
@@ -32,7 +33,7 @@ PYTHON = {
     "docs/how-to/automation.md": ["test_automation"],
     "docs/how-to/cluster.md": ["needs a cluster; test_cluster", "needs Slurm"],
     "docs/how-to/own-controller.md": ["needs python-control"],
-    "docs/how-to/own-parts.md": ["test_contracts"] * 4,
+    "docs/how-to/own-parts.md": ["test_contracts"] * 5,
     "docs/reference/exploring.md": [LONG],
     "docs/reference/python.md": [HERE, "test_gradients"],
 }
@@ -59,7 +60,10 @@ def test_the_field_reference_has_every_field():
                 row = reference.table((), [(f"`{name}`", info.description)])
                 assert row.splitlines()[-1].removesuffix(" |") in text, f"{model.__name__}.{name}"
     assert [
-        x for law in LAWS.values() for x in law.parameters if f"{law.name}.{x.name}" not in text
+        x
+        for one in (*LAWS.values(), *DRIVES.values())
+        for x in one.parameters
+        if f"{one.name}.{x.name}" not in text
     ] == []
 
 

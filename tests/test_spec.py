@@ -22,7 +22,7 @@ REFUSED = [
     ("gain_factor = 1", "gain_factor = 1: unknown field; did you mean 'control.gain_factor'?"),
     (
         "[drive]\nzzzz = 1",
-        "drive.zzzz = 1: unknown field; allowed: in [drive]: kind, kp, kd, force",
+        "drive.zzzz = 1: unknown field; allowed: in [drive]: kind, kinds, kp, kd, force",
     ),
     ('"" = 1', " = 1: unknown field; allowed: at the top: title, run, machine"),
     (

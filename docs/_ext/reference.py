@@ -11,7 +11,6 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from jaxmodel.laws import LAWS
 from jaxmodel.metrics import METRICS
 from studies.cli import app
 from studies.fitting.spec import ENTRIES, Fit
@@ -99,8 +98,7 @@ def fields_text() -> str:
     for name, info in Study.model_fields.items():
         if _is_section(info.annotation):
             parts.append(_section_text(f"[{name}]", info.annotation))
-            if OWN_FIELDS.startswith(f"{name}."):
-                parts.append(_laws_text())
+            parts += [_own_text(x) for x in OWN_FIELDS if x.startswith(f"{name}.")]
     own = {name: x for name, x in Sweep.model_fields.items() if name not in Block.model_fields}
     parts += [
         "## A sweep",
@@ -156,21 +154,22 @@ def _default(info: FieldInfo) -> str:
     return f"`{toml_value(info.default)}`"
 
 
-def _laws_text() -> str:
+def _own_text(place: str) -> str:
+    entries = OWN_FIELDS[place]
     rows = (
         (
-            f"`{law.name}.{x.name}`",
+            f"`{entry.name}.{x.name}`",
             x.text,
             x.unit,
             f"≥ {x.low:g} and ≤ {x.high:g}",
             f"`{x.default:g}`",
         )
-        for law in LAWS.values()
-        for x in law.parameters
+        for entry in entries.values()
+        for x in entry.parameters
     )
     heads = ("field", "meaning", "unit", "allowed", "default")
-    meaning = "Fields of single laws; one number for all links, or three."
-    return f"### `[{OWN_FIELDS}]`\n\n{meaning}\n\n{table(heads, rows)}"
+    meaning = f"Fields of single {entries.kind}s; one number for all links, or three."
+    return f"### `[{place}]`\n\n{meaning}\n\n{table(heads, rows)}"
 
 
 def metrics_text() -> str:

@@ -12,10 +12,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from jaxmodel.case import Case
-from jaxmodel.laws.contract import Parameter
 from jaxmodel.laws.link_model import LinkModel
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
+from jaxmodel.table import Parameter
 
 #: Corner of the model of the force over `bending_hz` [1]: behind drained patches, which show
 #: nothing at rest, a force that stays for ever could not be observed.

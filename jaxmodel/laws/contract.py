@@ -20,21 +20,10 @@ from jaxmodel.estimator import Estimator, design_estimator
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 from jaxmodel.state_space import StateSpace
-from jaxmodel.table import PartError
+from jaxmodel.table import Parameter, PartError, check_parameters
 
 #: What a channel is: a controlled mode, or a patch pair; "none" for a linear system without them.
 Channel = Literal["mode", "patch", "none"]
-
-
-class Parameter(NamedTuple):
-    """A law's own field in the study file, `[control.laws.NAME]`; one number, or three."""
-
-    name: str
-    default: float
-    unit: str
-    text: str
-    low: float  # smallest value allowed
-    high: float
 
 
 class NominalModel(NamedTuple):
@@ -78,18 +67,7 @@ def check_law(law: Law) -> None:
         raise PartError(f"{place}: channel = {law.channel!r}; allowed: 'mode', 'patch' or 'none'")
     if not callable(law.design):
         raise PartError(f"{place}: design = {law.design!r}; expected a function")
-    seen: set[str] = set()
-    for x in law.parameters:
-        if not isinstance(x, Parameter):
-            raise PartError(f"{place}: parameters: {x!r}; expected a Parameter")
-        if not x.name.isidentifier() or x.name in seen:
-            raise PartError(f"{place}: parameter {x.name!r}; expected a unique name")
-        if not x.low <= x.default <= x.high:
-            raise PartError(
-                f"{place}: parameter {x.name!r}: default {x.default:g}; "
-                f"allowed: {x.low:g} to {x.high:g}"
-            )
-        seen.add(x.name)
+    check_parameters(place, law.parameters)
 
 
 def check_feedback(law: Law, feedback: Feedback, n_channels: int, n_patches: int) -> None:

@@ -13,10 +13,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from jaxmodel.case import Case, Electronics, Structure
-from jaxmodel.laws.contract import NominalModel, Parameter, system_feedback
+from jaxmodel.laws.contract import NominalModel, system_feedback
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 from jaxmodel.state_space import StateSpace
+from jaxmodel.table import Parameter
 
 #: Field of laws with such a model.
 DAMPING = Parameter(

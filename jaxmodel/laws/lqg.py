@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from jaxmodel.case import Case, Control, Structure
 from jaxmodel.laws.bending import BENDING, bent, walk
-from jaxmodel.laws.contract import Law, NominalModel, Parameter, study_gains
+from jaxmodel.laws.contract import Law, NominalModel, study_gains
 from jaxmodel.laws.link_model import DAMPING, LinkModel, compensated, link_model
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 from jaxmodel.riccati import filter_gain, regulator_gain
 from jaxmodel.state_space import StateSpace
+from jaxmodel.table import Parameter
 
 
 def design(structure: Structure, case: Case, nominal: NominalModel) -> StateSpace:

@@ -8,13 +8,13 @@ from jaxmodel.control import PoleGains
 from jaxmodel.laws.contract import (
     Law,
     NominalModel,
-    Parameter,
     acting_channels,
     modal_feedback,
     study_gains,
 )
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
+from jaxmodel.table import Parameter
 
 
 def optimal_gains(omega: Array, control_weight: Array) -> PoleGains:

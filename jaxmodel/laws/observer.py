@@ -13,7 +13,7 @@ from functools import reduce
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.laws.bending import BENDING, bent, force_decay
-from jaxmodel.laws.contract import Law, NominalModel, Parameter, acting_channels
+from jaxmodel.laws.contract import Law, NominalModel, acting_channels
 from jaxmodel.laws.imsc import same
 from jaxmodel.laws.link_model import (
     DAMPING,
@@ -27,6 +27,7 @@ from jaxmodel.laws.poles import closed_modes
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 from jaxmodel.state_space import StateSpace
+from jaxmodel.table import Parameter
 
 
 def corrections(structure: Structure, case: Case, nominal: NominalModel) -> Array:

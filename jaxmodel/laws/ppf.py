@@ -14,10 +14,11 @@ from jaxmodel.case import Case, Electronics, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.electronics import measurement_chain
 from jaxmodel.estimator import Estimator, second_order
-from jaxmodel.laws.contract import Law, NominalModel, Parameter, modal_feedback, study_gains
+from jaxmodel.laws.contract import Law, NominalModel, modal_feedback, study_gains
 from jaxmodel.laws.imsc import same
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
+from jaxmodel.table import Parameter
 
 #: Highest corner over the assembled frequency, used where the chain itself lags by 90 degrees [1].
 HIGHEST_RATIO = 3.0

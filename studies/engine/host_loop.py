@@ -20,6 +20,7 @@ class SampledLoop(NamedTuple):
     mode_poles: np.ndarray  # of the link modes without control [rad/s], NaN: overdamped, (J, 3)
     omega: np.ndarray  # of the plant's modal coordinates [rad/s], (3, R)
     period: float  # [s]
+    is_drive: np.ndarray  # whether an entry of the state belongs to pose or drive, (n,)
 
     @property
     def n_modes(self) -> int:
@@ -40,9 +41,16 @@ def sampled_loop(
     matrices: LoopMatrices, omega: np.ndarray, period: float, n_tracked: int
 ) -> SampledLoop:
     """A loop on the host from matrices of `jaxmodel.sampled_loop`, NumPy arrays."""
-    poles = link_poles(matrices.plant, n_tracked)
+    is_drive = np.arange(len(matrices.open)) < 6
+    if matrices.reference is not None:  # the states that it enters are those of a sampled drive
+        is_drive |= np.any(matrices.reference != 0, axis=1)
     return SampledLoop(
-        open=matrices.open, feedback=matrices.feedback, mode_poles=poles, omega=omega, period=period
+        open=matrices.open,
+        feedback=matrices.feedback,
+        mode_poles=link_poles(matrices.plant, n_tracked),
+        omega=omega,
+        period=period,
+        is_drive=is_drive,
     )
 
 
@@ -87,9 +95,10 @@ def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
     """
     right, left = _eigenvectors(loop.open + factor * loop.feedback, pole)
     r = loop.n_modes
-    last = 6 + 6 * r  # the rest is sensors behind their filters and the controller
+    last = 6 + 6 * r  # the rest is sensors behind their filters, the controller, and the drive
     share = left * right
-    drive, links, filters = (abs(part.sum()) for part in (share[:6], share[6:last], share[last:]))
+    parts = (share[loop.is_drive], share[6:last], share[last:][~loop.is_drive[last:]])
+    drive, links, filters = (abs(part.sum()) for part in parts)
     hertz = abs(np.log(pole)) / loop.period / (2 * np.pi)
     if drive > max(links, filters):
         return f"drive of the sliders ({hertz:.0f} Hz)"

@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 from jaxmodel.case import Case, Structure
+from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.imsc import IMSC
 from jaxmodel.loci import (
@@ -131,7 +132,8 @@ def judge_loops(structure: Structure, cases: Case) -> LoopFigures:
 
         is_sharp = _least_damping(structure, whole) < LEAST_DAMPED
         is_sharp |= _unevenness(whole) > UNEVEN
-        is_sharp |= LAWS[structure.law].channel == "none"  # no return difference link by link
+        # no return difference link by link
+        is_sharp |= LAWS[structure.law].channel == "none" or DRIVES[structure.drive].is_sampled
         rows = np.flatnonzero(~is_sharp)
         for sweep in SWEEPS:
             if len(rows):

@@ -206,7 +206,7 @@ def _plant_steps(
     table: CaseTable, structure: Structure, members: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Plant steps per sample of each case, and which cases are too stiff for any allowed number."""
-    rate = _of_cases(table, structure, members, _DRIVE, _drive_rate)
+    rate = _of_cases(table, structure, members, _DRIVE, partial(_drive_rate, structure.drive))
     if structure.feedback == "ideal":
         rate = np.maximum(rate, _pole_decay(table, structure, members))
     period = 1 / table.values("electronics.sample_rate_hz")[members]
@@ -226,7 +226,7 @@ def _plant_steps(
 _DRIVE = ("drive.", "machine.slider_mass")
 
 
-_drive_rate = kept_jit()(drive_rate)
+_drive_rate = kept_jit(static_argnums=0)(drive_rate)
 _coupled_rate = kept_jit(static_argnums=0)(coupled_rate)
 
 

@@ -13,6 +13,7 @@ from jaxmodel import status
 from jaxmodel.axial import critical_force, lumping_error
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
+from jaxmodel.drives import DRIVES
 from jaxmodel.kinematics import SINGULAR_MARGIN, lift, path_status
 from jaxmodel.laws import is_modal, n_channels
 from jaxmodel.linear import linearise, mechanical, resting
@@ -98,7 +99,7 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
         end,
         shaper_length,
         worst,
-        drive_rate(case),
+        drive_rate(structure.drive, case),
         coupled_rate(structure, case),
         jnp.max(prepared.loop.omega),
         damping,
@@ -127,6 +128,7 @@ def _without_run(structure: Structure) -> Structure:
         "has_wrench",
         "controller_basis",
         "law",
+        "drive",
         "has_poles",
         "has_amplifier",
         "has_sensor_highpass",
@@ -359,7 +361,7 @@ def _drive_substeps(study: Study, rate: float) -> int:
         )
     slope = drive.coulomb_friction / drive.friction_speed
     parts = {
-        "drive.kd": drive.kd,
+        "drive.kd": 0.0 if DRIVES[drive.kind].is_sampled else drive.kd,
         "drive.viscous_friction": drive.viscous_friction,
         "drive.coulomb_friction": slope,
     }

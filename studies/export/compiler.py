@@ -112,8 +112,35 @@ def compiled(
         StudyError: the compiler rejects the code, or does not work.
     """
     n_channels, n_modes, length = sizes
+    with library(source, name, compiler, real) as loaded:
+        # no state word takes more than 8 bytes
+        room = ctypes.create_string_buffer(8 * (3 * n_modes + 2 * n_channels) + 64)
+        yield Code(
+            library=loaded,
+            name=name,
+            real=real,
+            reference=reference,
+            n_channels=n_channels,
+            shaper_length=length,
+            state=room,
+        )
+
+
+@contextmanager
+def library(source: Source, name: str, compiler: list[str], real: type) -> Iterator[ctypes.CDLL]:
+    """Compile C code and load it.
+
+    Args:
+        source: header and code.
+        name: of the files and prefix of functions.
+        compiler: command, from `find_compiler`.
+        real: NumPy's type of its numbers.
+
+    Raises:
+        StudyError: the compiler rejects the code, or does not work.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        header, code, library = (Path(folder) / f"{name}{end}" for end in (".h", ".c", ".so"))
+        header, code, built = (Path(folder) / f"{name}{end}" for end in (".h", ".c", ".so"))
         header.write_text(source.header, encoding="utf-8")
         code.write_text(source.code, encoding="utf-8")
         single = [f"-D{name.upper()}_REAL=float"] if real is np.float32 else []
@@ -125,28 +152,19 @@ def compiled(
             "-shared",
             "-fPIC",
             "-o",
-            str(library),
+            str(built),
             str(code),
+            "-lm",
         ]
         _run(command)
-        # no state word takes more than 8 bytes
-        room = ctypes.create_string_buffer(8 * (3 * n_modes + 2 * n_channels) + 64)
         try:
-            loaded = ctypes.CDLL(str(library))
+            loaded = ctypes.CDLL(str(built))
         except OSError as error:
             raise StudyError(
                 f"C compiler {shlex.join(compiler)}: its code does not run here ({error}); "
                 f"{_ALLOWED}"
             ) from None
-        yield Code(
-            library=loaded,
-            name=name,
-            real=real,
-            reference=reference,
-            n_channels=n_channels,
-            shaper_length=length,
-            state=room,
-        )
+        yield loaded
 
 
 def _run(command: list[str]) -> None:

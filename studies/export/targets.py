@@ -10,10 +10,12 @@ import json
 from collections.abc import Callable
 from typing import NamedTuple
 
+from jaxmodel.drives import DRIVES
 from jaxmodel.table import Table
 from studies.engine.blocks import ModalBlocks
 from studies.engine.channels import ActiveChannels
 from studies.engine.controller import FixedController
+from studies.export.c_drive import drive_code
 from studies.export.c_fixed import fixed_source
 from studies.export.c_floating import floating_source
 from studies.export.c_text import Source
@@ -23,7 +25,7 @@ from studies.export.fixed import FixedPoint, check_words, design_fixed, rounded
 from studies.export.fixed_blocks import FixedBlocks, design_blocks, rounded_blocks
 from studies.export.floating import BlockSignals, Signals, respond
 from studies.export.job import ExportResult, Job, check_loop, reference_motion
-from studies.export.verify import verify_document, verify_fixed, verify_floating
+from studies.export.verify import drive_checks, verify_document, verify_fixed, verify_floating
 
 
 class Target(NamedTuple):
@@ -54,16 +56,24 @@ def _export_floating(job: Job) -> ExportResult:
     loop = check_loop(job.exported, job.exported.channels, "")
     source = floating_source(job.exported, job.name, job.origin)
     files = _files(source, job.name)
+    drive = drive_code(job.exported, job.name, job.origin)
+    if drive is not None:
+        files |= _files(drive.source, drive.name)
     if not job.is_verified:
         return ExportResult(files, loop, None)
     reference = reference_motion(job)
     verified = verify_floating(job.exported, reference, source, job.name, job.compiler)
+    if drive is not None:
+        checks = [*verified.checks, *drive_checks(drive, job.compiler)]
+        verified = verified._replace(checks=checks)
     return ExportResult(files, loop, verified)
 
 
 def _export_fixed(job: Job) -> ExportResult:
     exported = job.exported
     check_words(exported)
+    if DRIVES[exported.structure.drive].is_sampled:
+        job.console.print("the sliders' drive is not part of it: --target c writes it, too")
     check_loop(exported, exported.channels, "")
     reference = reference_motion(job)
     signals = respond(exported.channels, exported.controller, reference.codes)

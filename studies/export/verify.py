@@ -13,6 +13,7 @@ from jaxmodel.shaper import Taps
 from studies.engine.blocks import ModalBlocks
 from studies.engine.controller import FixedController, arrange
 from studies.engine.programs import kept_jit
+from studies.export.c_drive import DriveCode, compare_drive
 from studies.export.c_text import Source
 from studies.export.compiler import Code, compiled
 from studies.export.document import Document, controller_of
@@ -289,6 +290,15 @@ def _compare(
     size = max(np.abs(expected).max(), rounded)
     difference = float(np.abs(values - expected).max() / (size if size > 0 else 1.0))
     return Check(what, f"{difference:.1e}", f"{allowed:.0e}", difference <= allowed)
+
+
+def drive_checks(code: DriveCode, compiler: list[str]) -> list[Check]:
+    """The C code of a sampled drive against the drive in JAX, in both precisions."""
+    found = compare_drive(code, compiler)
+    return [
+        Check(f"drive, random motion, {text}", f"{x:.1e}", f"{limit:.0e}", x <= limit)
+        for text, x, limit in zip(("double", "float"), found, (DOUBLE, SINGLE), strict=True)
+    ]
 
 
 def _stuck_codes(exported: FixedController, reference: LoopRun) -> np.ndarray:

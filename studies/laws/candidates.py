@@ -16,9 +16,10 @@ from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.laws import LAWS
-from jaxmodel.laws.contract import Law, Parameter
+from jaxmodel.laws.contract import Law
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import design_controller
+from jaxmodel.table import Parameter
 from studies.engine.controller import fixed_controller
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit

@@ -18,8 +18,17 @@ from studies.errors import StudyError, field_error, nearest
 from studies.space.axes import ALIASES, READY_MADE, Range, parse_range
 from studies.study.cases import case_of
 from studies.study.numbers import Numbers, position, put
-from studies.study.paths import checked_value, free_fields, known_field, overlaps, parse_entry
-from studies.study.spec import OWN_FIELDS, Study
+from studies.study.paths import (
+    Parts,
+    checked_value,
+    free_fields,
+    known_field,
+    overlaps,
+    own_place,
+    parse_entry,
+    parts_of,
+)
+from studies.study.spec import Study
 
 #: Puts values (p,) of free parameters, in the study's units, among the numbers of one case; nan
 #: leaves the case's value. Pass the same object, or an equal one, to avoid recompiling.
@@ -131,7 +140,7 @@ def plain_numbers(
     path: str,
     roles: Sequence[str],
     others: Sequence[str] = (),
-    laws: Sequence[str] = (),
+    parts: Sequence[Parts] = (),
 ) -> tuple[list[Free], Place]:
     """The numbers of one free field, and what puts their values among those of a study.
 
@@ -140,9 +149,9 @@ def plain_numbers(
         bounds: its range as the file writes it.
         study: where it starts from.
         path: where it is written, for messages.
-        roles: of the fields that can be free, besides the law's own.
+        roles: of the fields that can be free, besides the parts' own.
         others: further names that can be, for messages.
-        laws: control laws whose parameters can be free; (): that of the study.
+        parts: laws and drives whose parameters can be free; (): those of the study.
 
     Raises:
         StudyError: unknown name, bad bounds, a start outside them.
@@ -155,7 +164,7 @@ def plain_numbers(
         raise StudyError(f"{path}: cannot be free; {hint}")
     value = known_field(name, study, path)  # names the nearest field if there is none
     assert entry is not None
-    allowed = free_fields(laws or (study.control.law,), *roles)
+    allowed = free_fields(parts or (parts_of(study),), *roles)
     if entry.field not in allowed:
         hint = nearest(entry.field, allowed)
         raise StudyError(
@@ -213,8 +222,8 @@ def _entries(value: Any, indices: tuple[int, ...] = ()) -> list[tuple[tuple[int,
 
 def _set(positions: tuple[Any, ...], numbers: Numbers, values: Array) -> Numbers:
     for k, at in enumerate(positions):
-        if at[0].startswith(f"{OWN_FIELDS}.") and at[0] not in numbers:
-            continue  # of a law that this program does not have
+        if own_place(at[0]) and at[0] not in numbers:
+            continue  # of a law or drive that this program does not have
         numbers = put(numbers, at, values[k], keeps_missing=True)
     return numbers
 

@@ -47,9 +47,6 @@ class Block(Section):
 class Screen(Section):
     """All cases by the linear model, and only the best of them by the whole one."""
 
-    robustness: tuple[str, ...] = described(
-        (), "-", f"further figures of every sampled loop to keep: {', '.join((*MARGINS, *PEAKS))}"
-    )
     by: str = described("residual_rms", "-", "metric, or entry of one, that the screen ranks by")
     keep: float = described(0.05, "1", "share of the cases that are run", gt=0, le=1)
     subject_to: str = described(
@@ -74,6 +71,9 @@ class Sweep(Block):
     repeats: int = described(1, "1", "runs of each case, with their own seeds", ge=1, le=10**6)
     seed: int = described(0, "1", "of the sampling methods", ge=0, le=10**9)
     metrics: tuple[str, ...] = described((), "-", "metrics to keep; empty: all")
+    robustness: tuple[str, ...] = described(
+        (), "-", f"further figures of every sampled loop to keep: {', '.join((*MARGINS, *PEAKS))}"
+    )
     by: str = described("residual_rms", "-", "metric, or entry of one, that cases are ranked by")
     environments: tuple[str, ...] = described(
         (),

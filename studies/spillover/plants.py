@@ -124,6 +124,7 @@ class LoopBuilder:
             open=matrices.open[np.ix_(kept, kept)],
             feedback=matrices.feedback[np.ix_(kept, kept)],
             plant=matrices.plant[np.ix_(of_plant, of_plant)],
+            reference=None if matrices.reference is None else matrices.reference[kept],
         )
         period = float(self._design.case.electronics.period)
         return sampled_loop(matrices, omega[:, : plant.n_modes], period, plant.n_modes)
@@ -183,7 +184,7 @@ def plant_structure(design: FixedController, basis: str, n_modes: int) -> Struct
         is_distributed=nominal.is_distributed,
         has_static_correction=nominal.has_static_correction,
         law=SRF.name,
-        has_feedforward=nominal.has_feedforward,
+        drive=nominal.drive,
         has_friction=nominal.has_friction,
         has_position_gain=False,
         is_coupled=nominal.is_coupled,

@@ -25,13 +25,14 @@ from jaxmodel.case import (
     Structure,
     Windows,
 )
+from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law
 from jaxmodel.parameters import ASSEMBLIES, Beam, Damping, Geometry, Machine, Masses, Patches
 from studies.study.consistency import patch_centers
 from studies.study.fields import Columns, Fields
 from studies.study.numbers import Numbers, one_study, study_numbers
-from studies.study.spec import OWN_FIELDS, Study
+from studies.study.spec import OWN_DRIVES, OWN_LAWS, Study
 
 Tree = TypeVar("Tree")  # a Case, or numbers
 TWO_PI = 2 * np.pi
@@ -74,7 +75,7 @@ def build_structure(study: Study, columns: Columns | None = None) -> Structure:
         controller_basis=study.control.basis,
         feedback=study.control.feedback,
         law=study.control.law,
-        has_feedforward=study.drive.kind == "computed_torque",
+        drive=study.drive.kind,
         has_noise=study.run.smooth,
         has_position_gain=LAWS[study.control.law].has_position,
         is_smooth=study.run.smooth,
@@ -138,7 +139,7 @@ def case_of(structure: Structure, numbers: Numbers) -> Case:
         shaping=_shaping(numbers, xp),
         control=_control(numbers, structure, xp),
         electronics=_electronics(numbers, structure, xp),
-        drive=Drive(*(number(f"drive.{name}") for name in (*Drive._fields[:-1], "locked"))),
+        drive=_drive(numbers, structure),
         load=Load(*(number(f"load.{name}") for name in Load._fields)),
         initial=Initial(
             _fill(number("initial.modal"), (3, structure.n_modes), 0.0, xp),
@@ -150,6 +151,16 @@ def case_of(structure: Structure, numbers: Numbers) -> Case:
         ),
         windows=Windows(*(number(f"metrics.{name}") for name in Windows._fields)),
         seed=number("run.seed"),
+    )
+
+
+def _drive(numbers: Numbers, structure: Structure) -> Drive:
+    law = DRIVES[structure.drive]
+    names = {name: name for name in Drive._fields} | {"is_locked": "locked"}
+    del names["parameters"]
+    return Drive(
+        parameters={x.name: numbers[f"{OWN_DRIVES}.{law.name}.{x.name}"] for x in law.parameters},
+        **{name: numbers[f"drive.{field}"] for name, field in names.items()},
     )
 
 
@@ -282,7 +293,7 @@ def _control(numbers: Numbers, structure: Structure, xp: Any) -> Control:
         gain_factor=number("control.gain_factor"),
         is_per_mass=number("control.gain_unit").astype(float),
         feedthrough_factor=number("control.feedthrough_factor"),
-        parameters={x.name: number(f"{OWN_FIELDS}.{law.name}.{x.name}") for x in law.parameters},
+        parameters={x.name: number(f"{OWN_LAWS}.{law.name}.{x.name}") for x in law.parameters},
         system=numbers.get("state_space"),
     )
 
@@ -291,7 +302,7 @@ def law_parameters(study: Study, law: Law) -> dict[str, np.ndarray]:
     """A law's own fields in a study, whichever law the study selects, (3,) each."""
     fields = Fields(study)
     names = [x.name for x in law.parameters]
-    return {name: fields.each_link(f"{OWN_FIELDS}.{law.name}.{name}")[0] for name in names}
+    return {name: fields.each_link(f"{OWN_LAWS}.{law.name}.{name}")[0] for name in names}
 
 
 def signed_power(ratio: Any, exponent: Any, xp: Any = np) -> Any:

@@ -8,8 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxmodel.beam import BASES
+from jaxmodel.drives import DRIVES
+from jaxmodel.drives.contract import DriveLaw
 from jaxmodel.laws import LAWS
+from jaxmodel.laws.contract import Law
 from jaxmodel.piezo import VACUUM_PERMITTIVITY
+from jaxmodel.table import Table
 from studies.errors import field_error, nearest, shown
 from studies.study.state_space import check_system
 
@@ -68,7 +72,8 @@ def check_consistency(study: Study) -> None:
     _check_poles(study)
     check_system(study, n_patches)
     _check_lists(study)
-    _check_own_fields(study)
+    _check_own_fields("control.laws", control.laws, LAWS)
+    _check_own_fields("drive.kinds", study.drive.kinds, DRIVES)
     _check_basis(study)
     _check_stations(study)
     _check_sampling(study)
@@ -153,13 +158,15 @@ def _largest(value: Any) -> float:
     return max(map(_largest, value), default=0.0) if isinstance(value, tuple) else value
 
 
-def _check_own_fields(study: Study) -> None:
-    """Check laws' own fields; a sweep can include those of laws that are not selected."""
-    for name, fields in study.control.laws.items():
-        path = f"control.laws.{name}"
-        if name not in LAWS:
-            raise field_error(path, fields, ", ".join(LAWS), hint=nearest(name, LAWS))
-        parameters = {parameter.name: parameter for parameter in LAWS[name].parameters}
+def _check_own_fields(
+    place: str, written: dict[str, dict[str, Any]], table: Table[Law] | Table[DriveLaw]
+) -> None:
+    """Check own fields of laws or drives; a sweep can include those that are not selected."""
+    for name, fields in written.items():
+        path = f"{place}.{name}"
+        if name not in table:
+            raise field_error(path, fields, ", ".join(table), hint=nearest(name, table))
+        parameters = {parameter.name: parameter for parameter in table[name].parameters}
         for leaf, value in fields.items():
             if leaf not in parameters:
                 allowed = ", ".join(parameters) or "no field of its own"

@@ -18,10 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.case import Structure
+from jaxmodel.drives import DRIVES
+from jaxmodel.laws import LAWS
 from jaxmodel.laws.state_space import STATE_SPACE
 from studies.study.fields import Columns, Fields, nesting
-from studies.study.paths import LINKS, all_fields, field_choices, parse_entry
-from studies.study.spec import OWN_FIELDS, Study
+from studies.study.paths import LINKS, all_fields, field_choices, own_fields, own_place, parse_entry
+from studies.study.spec import OWN_DRIVES, OWN_LAWS, Study
 from studies.study.state_space import system_of
 from studies.study.window import DELAY, residual_delay
 
@@ -37,7 +39,7 @@ OF_MODE_1 = "control.damping"
 @cache
 def form_of(field: str) -> Form:
     """How the array of a field looks, from its type in the schema."""
-    if field.startswith(f"{OWN_FIELDS}."):
+    if own_place(field):
         return "link"
     if field_choices(field):
         return "choice"
@@ -83,10 +85,13 @@ def study_numbers(study: Study, structure: Structure, columns: Columns | None = 
     numbers: Numbers = {
         name: _array(fields, name, structure)
         for name in all_fields()
-        if name != DELAY and not name.startswith((f"{OWN_FIELDS}.", "state_space."))
+        if name != DELAY and not own_place(name) and not name.startswith("state_space.")
     }
-    own = f"{OWN_FIELDS}.{structure.law}."
-    numbers |= {name: fields.each_link(name) for name in all_fields() if name.startswith(own)}
+    own = [
+        *own_fields(OWN_LAWS, [LAWS[structure.law]]),
+        *own_fields(OWN_DRIVES, [DRIVES[structure.drive]]),
+    ]
+    numbers |= {name: fields.each_link(name) for name in own}
     # "auto" is that of the study without columns
     is_given = DELAY in fields.columns
     numbers[DELAY] = fields.numbers(DELAY) if is_given else np.array([residual_delay(study)])

@@ -1,24 +1,28 @@
 """Fields of a study by name: the only syntax, getter and setter.
 
 A name is a field and, for a list, the indices of an entry: `link.length`, `control.ratios[0][1]`.
-A control law's own fields are `control.laws.LAW.FIELD`; one that a study does not set has the
-law's default.
+The own fields of control laws and drives are `control.laws.LAW.FIELD` and `drive.kinds.KIND.FIELD`;
+one that a study does not set has its default.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from operator import attrgetter
 from typing import Any, NamedTuple, get_args
 
 from pydantic import BaseModel, ValidationError
 
+from jaxmodel.drives import DRIVES
+from jaxmodel.drives.contract import DriveLaw
 from jaxmodel.laws import LAWS
-from jaxmodel.laws.contract import Parameter
+from jaxmodel.laws.contract import Law
+from jaxmodel.table import Parameter
 from studies.errors import StudyError, nearest, shown
 from studies.study.consistency import check_consistency
 from studies.study.explain import choices_of, explain, unit_of
-from studies.study.spec import OWN_FIELDS, Study
+from studies.study.spec import OWN_DRIVES, OWN_FIELDS, OWN_LAWS, Study
 
 LINKS = 3
 #: An index that names its axis and counts from 1, as in the files: `residual_rms[link=1]`.
@@ -37,6 +41,27 @@ JUDGED_BY_STATUS = (
     "run.duration",
     "metrics.",
 )
+
+
+class Parts(NamedTuple):
+    """The exchangeable parts of a study; each combination has its own program."""
+
+    law: str  # of LAWS
+    drive: str  # of DRIVES
+
+    def owns(self, field: str) -> bool:
+        """Whether a field is none of a law or drive that is not among these."""
+        place = own_place(field)
+        name = self.law if place == OWN_LAWS else self.drive
+        return not place or field.startswith(f"{place}.{name}.")
+
+
+def parts_of(study: Study, changed: Mapping[str, Any] | None = None) -> Parts:
+    """Law and drive of a study, with other values of some fields."""
+    changed = changed or {}
+    return Parts(
+        changed.get("control.law", study.control.law), changed.get("drive.kind", study.drive.kind)
+    )
 
 
 class Entry(NamedTuple):
@@ -61,37 +86,51 @@ def all_fields() -> list[str]:
         inner = info.annotation
         if isinstance(inner, type) and issubclass(inner, BaseModel):
             names += [f"{section}.{leaf}" for leaf in inner.model_fields]
-    names.remove(OWN_FIELDS)
-    return names + [
-        f"{OWN_FIELDS}.{law.name}.{x.name}" for law in LAWS.values() for x in law.parameters
-    ]
+    for place, table in OWN_FIELDS.items():
+        names.remove(place)
+        names += own_fields(place, table.values())
+    return names
+
+
+def own_fields(place: str, entries: Iterable[Law | DriveLaw]) -> list[str]:
+    """Own fields of laws or drives.
+
+    Args:
+        place: in `OWN_FIELDS`.
+        entries: of its table.
+    """
+    return [f"{place}.{entry.name}.{x.name}" for entry in entries for x in entry.parameters]
+
+
+def own_place(field: str) -> str:
+    """Place in `OWN_FIELDS` of an own field of a law or drive, "" for other fields."""
+    return next((place for place in OWN_FIELDS if field.startswith(f"{place}.")), "")
 
 
 def own_parameter(field: str) -> Parameter | None:
-    """The law's parameter behind a field, if there is one."""
-    if not field.startswith(f"{OWN_FIELDS}."):
+    """The parameter of a law or drive behind a field, if there is one."""
+    place = own_place(field)
+    if not place:
         return None
-    law, _, leaf = field.removeprefix(f"{OWN_FIELDS}.").partition(".")
-    parameters = LAWS[law].parameters if law in LAWS else ()
+    name, _, leaf = field.removeprefix(f"{place}.").partition(".")
+    table = OWN_FIELDS[place]
+    parameters = table[name].parameters if name in table else ()
     return next((parameter for parameter in parameters if parameter.name == leaf), None)
 
 
 def is_each_link(field: str) -> bool:
     """Whether a field takes one number for all links, or three."""
-    return field in EACH_LINK or field.startswith(f"{OWN_FIELDS}.")
+    return field in EACH_LINK or bool(own_place(field))
 
 
 def field_value(study: Study, field: str) -> Any:
     """Value of a field of a study."""
     parameter = own_parameter(field)
-    value: Any = study
-    for part in field.split("."):
-        if isinstance(value, dict):
-            assert parameter is not None
-            value = value.get(part, {} if part in LAWS else parameter.default)
-        else:
-            value = getattr(value, part)
-    return value
+    if parameter is not None:
+        place = own_place(field)
+        name, _, leaf = field.removeprefix(f"{place}.").partition(".")
+        return attrgetter(place)(study).get(name, {}).get(leaf, parameter.default)
+    return attrgetter(field)(study)
 
 
 def field_unit(field: str) -> str:
@@ -112,8 +151,8 @@ def field_choices(field: str) -> tuple[str, ...]:
     return choices_of(fields[leaf].annotation, fields[leaf].metadata) if leaf in fields else ()
 
 
-def free_fields(laws: Iterable[str], *roles: str) -> tuple[str, ...]:
-    """Fields that can be free, and those of some laws.
+def free_fields(parts: Iterable[Parts], *roles: str) -> tuple[str, ...]:
+    """Fields that can be free, and those of some laws and drives.
 
     roles: `DESIGN`, `MACHINE`.
     """
@@ -123,8 +162,9 @@ def free_fields(laws: Iterable[str], *roles: str) -> tuple[str, ...]:
         for leaf, info in getattr(outer.annotation, "model_fields", {}).items()
         if isinstance(info.json_schema_extra, dict) and info.json_schema_extra.get("free") in roles
     ]
-    own = (f"{OWN_FIELDS}.{name}.{x.name}" for name in laws for x in LAWS[name].parameters)
-    return (*names, *own)
+    laws, drives = (dict.fromkeys(x) for x in zip(*parts, strict=True))
+    own = own_fields(OWN_LAWS, [LAWS[name] for name in laws])
+    return (*names, *own, *own_fields(OWN_DRIVES, [DRIVES[name] for name in drives]))
 
 
 def as_list(field: str, value: Any) -> Any:

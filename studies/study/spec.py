@@ -13,11 +13,15 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jaxmodel.beam import BASES
+from jaxmodel.drives import DRIVES
+from jaxmodel.drives.contract import DriveLaw
 from jaxmodel.estimator import KINDS
 from jaxmodel.laws import LAWS
+from jaxmodel.laws.contract import Law
 from jaxmodel.motion import PROFILES
 from jaxmodel.parameters import HOME
 from jaxmodel.shaper import SHAPERS
+from jaxmodel.table import Table
 from studies.errors import StudyError, field_error
 from studies.study.choices import OWN, OneOf
 from studies.study.consistency import check_consistency
@@ -25,8 +29,9 @@ from studies.study.explain import explain
 from studies.study.files import READY, read_toml
 from studies.study.state_space import with_matrices
 
-#: Where laws' own fields are.
-OWN_FIELDS = "control.laws"
+#: Where the own fields of control laws and drives are, `PLACE.NAME.FIELD`.
+OWN_LAWS, OWN_DRIVES = "control.laws", "drive.kinds"
+OWN_FIELDS: dict[str, Table[Law] | Table[DriveLaw]] = {OWN_LAWS: LAWS, OWN_DRIVES: DRIVES}
 Basis = Annotated[str, OneOf(lambda: BASES)]
 #: Value of `metrics.residual_delay` that leaves the number to `studies.study.window`.
 AUTO = "auto"
@@ -56,16 +61,24 @@ EachMode: TypeAlias = EachLink[Number] | tuple[()] | tuple[tuple[Number, ...], .
 
 
 class OwnFields:
-    """Annotation of `control.laws`: describes what it can hold."""
+    """Annotation of `control.laws` and `drive.kinds`: describes what they can hold."""
+
+    def __init__(self, place: str) -> None:
+        """
+        Args:
+            place: in `OWN_FIELDS`.
+        """
+        self._place = place
 
     @property
     def allowed(self) -> str:
+        table = OWN_FIELDS[self._place]
         tables = [
-            f"{law.name}.{x.name} ({x.text} [{x.unit}], {x.low:g} to {x.high:g}; {x.default:g})"
-            for law in LAWS.values()
-            for x in law.parameters
+            f"{entry.name}.{x.name} ({x.text} [{x.unit}], {x.low:g} to {x.high:g}; {x.default:g})"
+            for entry in table.values()
+            for x in entry.parameters
         ]
-        return f"tables by law; {', '.join(tables)}"
+        return f"tables by {table.kind}; {', '.join(tables)}"
 
 
 #: What can be free: tunings move what a designer decides, fits also what is found by measuring.
@@ -276,7 +289,7 @@ class ControlSection(Section):
         "sampled", "-", "digital loop, the paper's continuous state feedback, or none"
     )
     law: Annotated[str, OneOf(lambda: LAWS, OWN)] = described("imsc", "-", "control law")
-    laws: Annotated[dict[str, dict[str, EachLink[float]]], OwnFields()] = described(
+    laws: Annotated[dict[str, dict[str, EachLink[float]]], OwnFields(OWN_LAWS)] = described(
         {}, "-", "fields of the laws, by law"
     )
     basis: Basis = described("pinned_pinned", "-", "modal basis of the controller's model")
@@ -431,7 +444,12 @@ class ElectronicsSection(Section):
 class DriveSection(Section):
     """Slider servo and disturbances."""
 
-    kind: Literal["pd", "computed_torque"] = described("pd", "-", "PD, or PD with computed torque")
+    kind: Annotated[str, OneOf(lambda: DRIVES, OWN)] = described(
+        "pd", "-", "law of the drive; those with an observer or a sliding mode are sampled"
+    )
+    kinds: Annotated[dict[str, dict[str, EachLink[float]]], OwnFields(OWN_DRIVES)] = described(
+        {}, "-", "fields of the drives, by kind"
+    )
     kp: float = described(2e4, "N/m", "position gain Kp", ge=0, le=1e8, free=DESIGN)
     kd: float = described(60.0, "N s/m", "velocity gain Kd", ge=0, le=1e5, free=DESIGN)
     force_limit: float = described(1e3, "N", "motors, +-", gt=0, le=1e6)

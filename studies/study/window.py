@@ -12,6 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from jaxmodel.case import Drive
+from jaxmodel.drives import DRIVES
+from jaxmodel.drives.contract import SliderError
 from jaxmodel.parameters import ASSEMBLIES
 from studies.errors import StudyError, field_error
 from studies.study.consistency import each_link
@@ -131,20 +134,61 @@ def settling_time(study: Study) -> float:
 
     The poles are those of the machine with rigid links at the last way-point, its sliders held by
     k_p and k_d (and viscous friction): with the inertia M of the pose and the sliders' rates J X',
-    each lambda of J^T J v = lambda M v is a mode s^2 + lambda k_d s + lambda k_p = 0.
+    each lambda of J^T J v = lambda M v is a mode s^2 + lambda k_d s + lambda k_p = 0, and of third
+    order where the drive remembers. Where the drives differ from slider to slider, each is taken
+    for all.
 
     Returns:
         inf if a pole has no decay.
     """
-    drive = study.drive
-    stiffness, resistance = drive.kp, drive.kd + drive.viscous_friction
     inertia, rates = rigid_machine(study)
     # both are scaled by M^(-1/2), which keeps the problem symmetric
     half = np.linalg.inv(np.linalg.cholesky(inertia))
     scale = np.linalg.eigvalsh(half @ rates.T @ rates @ half.T)
-    poles = [np.roots([1.0, s * resistance, s * stiffness]) for s in scale]
+    drives = np.unique(_drive_slopes(study), axis=0)
+    poles = np.concatenate([_poles(drive, s) for drive in drives for s in scale])
     decay = float(np.min(-np.real(poles)))
     return math.log(1 / SETTLED) / decay if decay > 0 else math.inf
+
+
+#: Deviation at which a drive is linearised: a power of two, so that proportional ones are exact.
+_SMALL = 2.0**-40
+
+
+def _drive_slopes(study: Study) -> np.ndarray:
+    """Derivatives at rest by e, e' and the memory, of F_fb and of the memory's rate, (3, 2, 3)."""
+    written, law = study.drive, DRIVES[study.drive.kind]
+    own = {
+        x.name: each_link(written.kinds.get(law.name, {}).get(x.name, x.default))
+        for x in law.parameters
+    }
+    names = [x for x in Drive._fields if x not in ("parameters", "is_locked")]
+    drive = Drive(
+        parameters=own,
+        is_locked=np.zeros(()),
+        **{name: each_link(getattr(written, name)) for name in names},
+    )
+    period, zero = 1 / study.electronics.sample_rate_hz, np.zeros(3)
+    slopes = np.zeros((3, 2, 3))
+    for k in range(3 if law.update else 2):
+        e, rate, memory = (_SMALL * np.ones(3) if k == j else zero for j in range(3))
+        error = SliderError(e, rate)
+        force = np.asarray(law.force(drive, memory if law.update else None, error, True))
+        slopes[:, 0, k] = force / _SMALL
+        if law.update:
+            after = np.asarray(law.update(drive, memory, error, force, np.asarray(period)))
+            slopes[:, 1, k] = (after - memory) / (_SMALL * period)
+    slopes[:, 0, 1] += written.viscous_friction
+    return slopes
+
+
+def _poles(slopes: np.ndarray, scale: float) -> np.ndarray:
+    """Poles of e'' = -scale F_fb under `_drive_slopes` of a slider [1/s], (2,) or (3,)."""
+    (stiffness, resistance, recall), own = slopes
+    if not np.any(own):
+        return np.roots([1.0, scale * resistance, scale * stiffness])
+    state = [[0.0, 1.0, 0.0], [-scale * x for x in (stiffness, resistance, recall)], own]
+    return np.linalg.eigvals(np.array(state))
 
 
 def rigid_machine(study: Study) -> tuple[np.ndarray, np.ndarray]:

@@ -20,7 +20,7 @@ from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.study.cases import build_cases, build_structure, in_working_precision
 from studies.study.numbers import one_study, study_numbers
-from studies.study.paths import set_values
+from studies.study.paths import Parts, parts_of, set_values
 from studies.study.spec import Study, parse_study
 from studies.tuning.evaluate import first_residual, tuned_structure
 from studies.tuning.free import PLACEMENT
@@ -147,8 +147,8 @@ class PlainRuns:
         return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
 
 
-class LawRuns:
-    """`PlainRuns` of each control law, made when they are needed."""
+class PartRuns:
+    """`PlainRuns` of each law and drive, made when they are needed."""
 
     def __init__(self, spec: TuneSpec, count: int) -> None:
         """
@@ -157,21 +157,21 @@ class LawRuns:
             count: of a batch, about.
         """
         self._spec, self._count = spec, count
-        self._programs: dict[str, PlainRuns] = {}
+        self._programs: dict[Parts, PlainRuns] = {}
 
-    def of(self, law: str) -> PlainRuns:
-        """Those of one law."""
-        if law not in self._programs:
-            self._programs[law] = PlainRuns(shown_structure(self._spec, law), self._count)
-        return self._programs[law]
+    def of(self, parts: Parts) -> PlainRuns:
+        """Those of one law and drive."""
+        if parts not in self._programs:
+            self._programs[parts] = PlainRuns(shown_structure(self._spec, parts), self._count)
+        return self._programs[parts]
 
 
-def judge(spec: TuneSpec, designs: list[Study], runs: LawRuns) -> list[JudgedDesign]:
+def judge(spec: TuneSpec, designs: list[Study], runs: PartRuns) -> list[JudgedDesign]:
     """Run designs on scenarios not used in the tuning, and as in their own files.
 
     Args:
         spec: of the tuning.
-        designs: studies that differ from the tuning's own only in numbers and control law; its own
+        designs: studies that differ from the tuning's own only in numbers, law and drive; its own
             comes first.
         runs: of the tuning.
     """
@@ -180,7 +180,7 @@ def judge(spec: TuneSpec, designs: list[Study], runs: LawRuns) -> list[JudgedDes
     by_design = _run_designs(designs, columns, runs)
     metrics = by_design.metrics
     baseline = jax.tree.map(lambda x: x[0], metrics)
-    end = runs.of(spec.law()).structure.n_steps / spec.study.electronics.sample_rate_hz
+    end = runs.of(spec.parts()).structure.n_steps / spec.study.electronics.sample_rate_hz
     judged = []
     for k, study in enumerate(designs):
         of_design = jax.tree.map(lambda x, k=k: x[k], metrics)
@@ -205,18 +205,18 @@ def judge(spec: TuneSpec, designs: list[Study], runs: LawRuns) -> list[JudgedDes
     return [_with_poles(study, design) for study, design in zip(designs, judged, strict=True)]
 
 
-def _run_designs(designs: list[Study], columns: dict[str, np.ndarray], runs: LawRuns) -> Result:
+def _run_designs(designs: list[Study], columns: dict[str, np.ndarray], runs: PartRuns) -> Result:
     """Runs of designs in scenarios, then as in their own files; (designs, scenarios + 1, ...)."""
-    laws, count = [study.control.law for study in designs], len(columns["run.seed"])
+    every, count = [parts_of(study) for study in designs], len(columns["run.seed"])
     order, results = [], []
-    for law in dict.fromkeys(laws):
-        program, chosen = runs.of(law), [k for k, x in enumerate(laws) if x == law]
-        parts = []
+    for parts in dict.fromkeys(every):
+        program, chosen = runs.of(parts), [k for k, x in enumerate(every) if x == parts]
+        lanes = []
         for k in chosen:
             fresh, file = (build_cases(designs[k], x, program.structure) for x in (columns, {}))
-            parts += [_repeat(fresh, count), _repeat(file, 1)]
+            lanes += [_repeat(fresh, count), _repeat(file, 1)]
         rows = len(chosen) * (count + 1)
-        result = program.run(jax.tree.map(lambda *x: np.concatenate(x), *parts), rows)
+        result = program.run(jax.tree.map(lambda *x: np.concatenate(x), *lanes), rows)
         shape = len(chosen), count + 1
         results.append(jax.tree.map(lambda x, n=shape: x.reshape(*n, *x.shape[1:]), result))
         order += chosen
@@ -244,9 +244,9 @@ def _with_poles(study: Study, judged: JudgedDesign) -> JudgedDesign:
     return judged._replace(poles=pole_report(structure, case, loop))
 
 
-def shown_structure(spec: TuneSpec, law: str) -> Structure:
-    """Program of a law's runs shown in a report."""
-    return tuned_structure(spec, law)._replace(metrics=objective_of(spec).shown_metrics)
+def shown_structure(spec: TuneSpec, parts: Parts) -> Structure:
+    """Program of the runs of one law and drive shown in a report."""
+    return tuned_structure(spec, parts)._replace(metrics=objective_of(spec).shown_metrics)
 
 
 def search(spec: TuneSpec, screen: Any) -> RandomSearch:
@@ -264,9 +264,9 @@ def search(spec: TuneSpec, screen: Any) -> RandomSearch:
     points = np.where(family.is_free, points[:n], own_place)
     values = np.where(family.is_free, spec.free.values(points), np.nan)
     columns = scenario_columns(spec, spec.tune.scenarios.count, spec.tune.scenarios.seed)
-    law = spec.law(family)
-    count, structure = len(columns["run.seed"]), shown_structure(spec, law)
-    is_own = law == spec.law()
+    parts = spec.parts(family)
+    count, structure = len(columns["run.seed"]), shown_structure(spec, parts)
+    is_own = parts == spec.parts()
     measure = None if is_own else _baseline_metrics(spec, columns)
     lanes = lane_columns(spec, columns, [None if is_own else family, *[family] * CHUNK])
     numbers = study_numbers(spec.study, structure, lanes)
@@ -314,7 +314,7 @@ def search(spec: TuneSpec, screen: Any) -> RandomSearch:
 
 
 def _baseline_metrics(spec: TuneSpec, columns: dict[str, np.ndarray]) -> Any:
-    """Metrics of the baseline in scenarios, by the program of its own law."""
-    count, structure = len(columns["run.seed"]), shown_structure(spec, spec.law())
+    """Metrics of the baseline in scenarios, by the program of its own law and drive."""
+    count, structure = len(columns["run.seed"]), shown_structure(spec, spec.parts())
     cases = build_cases(spec.study, lane_columns(spec, columns, [None]), structure)
     return PlainRuns(structure, count).run(cases, count).metrics

@@ -22,6 +22,7 @@ from studies.engine.preflight import check_run
 from studies.errors import StudyError
 from studies.study.cases import build_structure, in_working_precision
 from studies.study.numbers import study_numbers
+from studies.study.paths import Parts
 from studies.tuning.linear_fidelity import LinearFidelity
 from studies.tuning.objective import (
     Objective,
@@ -49,7 +50,7 @@ class Evaluation(NamedTuple):
 
 
 class Evaluator:
-    """Evaluates batches of one size and order of families, the designs of each law by a program."""
+    """Evaluates batches of one size and order of families; each law and drive has its program."""
 
     def __init__(self, spec: TuneSpec, families: list[Family]) -> None:
         """
@@ -63,11 +64,11 @@ class Evaluator:
         self.spec, self.families = spec, families
         self.goal, self.linear = objective_of(spec), LinearFidelity(spec, families)
         self.is_free = np.stack([family.is_free for family in families])
-        laws = [spec.law(family) for family in families]
-        # the baseline's law first: all designs are measured against it
+        every = [spec.parts(family) for family in families]
+        # the baseline's parts first: all designs are measured against it
         self._programs = [
-            _LawRuns(spec, law, families, np.flatnonzero([x == law for x in laws]))
-            for law in dict.fromkeys([spec.law(), *laws])
+            _PartRuns(spec, parts, families, np.flatnonzero([x == parts for x in every]))
+            for parts in dict.fromkeys([spec.parts(), *every])
         ]
         self.lanes = sum(program.lanes for program in self._programs)  # runs of a batch
         self.run_time = float("nan")  # time per run of the last batch [s]
@@ -154,26 +155,28 @@ class _Judged(NamedTuple):
     residual: np.ndarray
 
 
-class _LawRuns:
-    """The runs of designs of one control law."""
+class _PartRuns:
+    """The runs of designs of one law and drive."""
 
-    def __init__(self, spec: TuneSpec, law: str, families: list[Family], rows: np.ndarray) -> None:
+    def __init__(
+        self, spec: TuneSpec, parts: Parts, families: list[Family], rows: np.ndarray
+    ) -> None:
         """
         Args:
             spec: of the tuning.
-            law: of these designs.
+            parts: of these designs.
             families: of all designs.
-            rows: places of those of this law among them.
+            rows: places of those designs among them.
         """
         self.rows, self._families = rows, [families[k] for k in rows]
-        structure = tuned_structure(spec, law)._replace(is_smooth=True, has_noise=True)
+        structure = tuned_structure(spec, parts)._replace(is_smooth=True, has_noise=True)
         columns = scenario_columns(spec, spec.tune.scenarios.count, spec.tune.scenarios.seed)
         self.scenarios = len(columns["run.seed"])
         self.lanes = self.scenarios * (1 + len(rows))
         self._layout = _layout(self.lanes)
         lanes = self._layout.filled(self.lanes)
-        # with another law than the baseline's, the first family stands in its place, unused
-        first = None if law == spec.law() else self._families[0]
+        # with other parts than the baseline's, the first family stands in its place, unused
+        first = None if parts == spec.parts() else self._families[0]
         whole = lane_columns(spec, columns, [first, *self._families])
         study = spec.study.change(run__smooth=True)
         padded = {name: column[lanes] for name, column in whole.items()}
@@ -263,14 +266,14 @@ def first_residual(goal: Objective, metrics: Any) -> np.ndarray:
     return np.sqrt(np.mean(metrics.residual_rms[:, 0, list(goal.links)] ** 2, axis=(1, 2)))
 
 
-def tuned_structure(spec: TuneSpec, law: str) -> Structure:
-    """Program of all designs of a law in all scenarios, with everything that can be free."""
-    families = [family for family in (None, *spec.families) if spec.law(family) == law]
+def tuned_structure(spec: TuneSpec, parts: Parts) -> Structure:
+    """Program of the designs of a law and drive in all scenarios, with all that can be free."""
+    families = [family for family in (None, *spec.families) if spec.parts(family) == parts]
     structures = [check_run(nominal(spec, family))[0] for family in families]
-    return build_structure(spec.studies(law)[0])._replace(
+    return build_structure(spec.studies(parts)[0])._replace(
         metrics=objective_of(spec).metrics,
         substeps=max(x.substeps for x in structures),
         has_noise=any(x.has_noise for x in structures),
-        has_poles=spec.has_poles(law),
-        has_position_gain=spec.has_position_gain(law),
+        has_poles=spec.has_poles(parts),
+        has_position_gain=spec.has_position_gain(parts),
     )

@@ -27,6 +27,7 @@ from studies.space.free import (
 )
 from studies.study.consistency import each_link, patch_centers, patch_pitch
 from studies.study.numbers import Numbers
+from studies.study.paths import Parts
 from studies.study.spec import DESIGN, Study
 
 #: Free name that stands for several numbers.
@@ -41,27 +42,27 @@ def writes(number: Free) -> tuple[str, ...]:
     return ("patches.centers",) if number.key == PLACEMENT else (number.name,)
 
 
-def free_numbers(written: dict[str, Any], study: Study, laws: Sequence[str] = ()) -> FreeNumbers:
+def free_numbers(written: dict[str, Any], study: Study, parts: Sequence[Parts] = ()) -> FreeNumbers:
     """Free parameters from what the file says.
 
     Args:
         written: ranges by name, from `[tune.free]`.
         study: the initial design.
-        laws: control laws whose parameters can be free; (): that of the study.
+        parts: laws and drives whose parameters can be free; (): those of the study.
 
     Raises:
         StudyError: nothing free, unknown name, bad bounds, a start outside them.
     """
     if not written:
         raise field_error("tune.free", {}, "one free field or more")
-    parts: list[tuple[list[Free], Place]] = []
+    fields: list[tuple[list[Free], Place]] = []
     for name, bounds in written.items():
         path = f"tune.free.{shown_name(name)}"
         if name == PLACEMENT:
-            parts.append(_placement(bounds, study, path))
+            fields.append(_placement(bounds, study, path))
         else:
-            parts.append(plain_numbers(name, bounds, study, path, (DESIGN,), (PLACEMENT,), laws))
-    free = join_numbers(parts)
+            fields.append(plain_numbers(name, bounds, study, path, (DESIGN,), (PLACEMENT,), parts))
+    free = join_numbers(fields)
     check_twice(free.numbers, "tune.free")
     _check_decided(free.numbers)
     if study.control.has_poles:

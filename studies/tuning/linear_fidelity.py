@@ -30,6 +30,7 @@ from studies.engine.stability import gain_margin
 from studies.study.cases import as_arrays, build_case, build_structure, case_of
 from studies.study.margin import MARGIN_MODES
 from studies.study.numbers import Numbers, one_study, stack_numbers
+from studies.study.paths import parts_of
 from studies.study.spec import Study
 from studies.tuning.scenarios import nominal
 from studies.tuning.spec import BASELINE, Family, TuneSpec
@@ -75,10 +76,10 @@ class LinearFidelity:
         """
         self._spec, self.names, self._links = spec, spec.loop_limits, spec.counted_links
         self._pose = np.array(nominal(spec, None).motion.waypoints[0])
-        laws = [spec.law(family) for family in families]
+        every = [spec.parts(family) for family in families]
         self._batches = {
-            law: _batch(spec, families, np.flatnonzero([x == law for x in laws]))
-            for law in dict.fromkeys(laws)
+            parts: _batch(spec, families, np.flatnonzero([x == parts for x in every]))
+            for parts in dict.fromkeys(every)
         }
         self._own: DesignFigures | None = None
         self._limits = np.array(
@@ -161,7 +162,7 @@ class LinearFidelity:
 
 
 class _Batch(NamedTuple):
-    """Designs of one control law."""
+    """Designs of one law and drive."""
 
     rows: np.ndarray  # places among all designs, rising
     structure: Structure
@@ -170,8 +171,8 @@ class _Batch(NamedTuple):
 
 def _batch(spec: TuneSpec, families: list[Family], rows: np.ndarray) -> _Batch:
     chosen = [families[k] for k in rows]
-    law = spec.law(chosen[0])
-    first = None if law == spec.law() else chosen[0]
+    parts = spec.parts(chosen[0])
+    first = None if parts == spec.parts() else chosen[0]
     structure = _judged_structure(spec, nominal(spec, first))
     of_family = {
         name: one_study(with_margin_modes(nominal(spec, family)), structure)
@@ -182,12 +183,12 @@ def _batch(spec: TuneSpec, families: list[Family], rows: np.ndarray) -> _Batch:
 
 
 def _judged_structure(spec: TuneSpec, study: Study) -> Structure:
-    """Program of the linearised loop of a study's law."""
+    """Program of the linearised loop of a study's law and drive."""
     return build_structure(with_margin_modes(study))._replace(
         n_frequencies=1,
         has_noise=False,
         metrics=(),
-        has_position_gain=spec.has_position_gain(study.control.law),
+        has_position_gain=spec.has_position_gain(parts_of(study)),
     )
 
 
@@ -289,7 +290,7 @@ def loop_figures(spec: TuneSpec, study: Study) -> DesignFigures:
     """Figures of a design's loop on a plant of 12 modes or more.
 
     Args:
-        spec: of the tuning; its designs of one law share a program.
+        spec: of the tuning; its designs of one law and drive share a program.
         study: one of them, with sampled feedback.
     """
     larger = with_margin_modes(study)

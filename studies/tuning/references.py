@@ -20,7 +20,7 @@ from studies.study.cases import build_cases
 from studies.study.entries import parse_entries
 from studies.study.resolution import is_deflection, least_step, resolution_text
 from studies.study.spec import Study
-from studies.tuning.check import JudgedDesign, LawRuns, PlainRuns, judge
+from studies.tuning.check import JudgedDesign, PartRuns, PlainRuns, judge
 from studies.tuning.linear_fidelity import DesignFigures, loop_figures
 from studies.tuning.objective import allowed_limits, baseline_limits, judge_designs, objective_of
 from studies.tuning.optimise import KEPT, excess
@@ -74,10 +74,10 @@ def compare(
         The baseline, the best designs, and what they have to beat.
     """
     fresh, is_on = spec.tune.scenarios.check * len(spec.moves), spec.study.is_controlled
-    runs = LawRuns(spec, (fresh + 1) * (len(designs) + 2))
+    runs = PartRuns(spec, (fresh + 1) * (len(designs) + 2))
     if is_on:
         say(f"{FIELD} alone, for comparison")
-    scan = scan_gain(spec, runs.of(spec.law()))
+    scan = scan_gain(spec, runs.of(spec.parts()))
     others = {}
     if is_on:
         others[WITHOUT] = spec.study.uncontrolled()
@@ -100,7 +100,7 @@ def scan_gain(spec: TuneSpec, runs: PlainRuns) -> GainScan | None:
 
     Args:
         spec: of the tuning.
-        runs: of the baseline's law.
+        runs: of the baseline's law and drive.
 
     Returns:
         None where it is the only free parameter, or has no effect.

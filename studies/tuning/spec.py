@@ -21,6 +21,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from pydantic import ValidationError
 
+from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
 from jaxmodel.metrics import METRICS
 from jaxmodel.robustness import MARGINS, PEAKS
@@ -31,8 +32,16 @@ from studies.study.cases import build_structure
 from studies.study.entries import controlled_links, entry_sizes, parse_entries
 from studies.study.explain import explain
 from studies.study.files import read_toml
-from studies.study.paths import checked_value, is_each_link, known_field, overlaps, set_value
-from studies.study.spec import OWN_FIELDS, Section, Study, described, parse_study
+from studies.study.paths import (
+    Parts,
+    checked_value,
+    is_each_link,
+    known_field,
+    overlaps,
+    parts_of,
+    set_value,
+)
+from studies.study.spec import Section, Study, described, parse_study
 from studies.study.window import check_varied, with_window
 from studies.tuning.free import free_numbers, writes
 
@@ -123,26 +132,26 @@ class TuneSpec(NamedTuple):
         """The family with the most free parameters."""
         return int(np.argmax([family.is_free.sum() for family in self.families]))
 
-    def law(self, family: Family | None = None) -> str:
-        """Control law of a family's designs; None: of the baseline."""
-        return law_of(self.study, {} if family is None else family.columns)
+    def parts(self, family: Family | None = None) -> Parts:
+        """Law and drive of a family's designs; None: of the baseline."""
+        return parts_of(self.study, {} if family is None else family.columns)
 
-    def studies(self, law: str) -> list[Study]:
-        """The baseline and the families' studies, those of one law."""
+    def studies(self, parts: Parts) -> list[Study]:
+        """The baseline and the families' studies, those with one law and drive."""
         every = (self.study, *(family.study(self.study) for family in self.families))
-        return [study for study in every if study.control.law == law]
+        return [study for study in every if parts_of(study) == parts]
 
-    def has_poles(self, law: str) -> bool:
-        """Whether the gains of any design of a law follow from poles."""
-        return any(study.control.has_poles for study in self.studies(law))
+    def has_poles(self, parts: Parts) -> bool:
+        """Whether the gains of any such design follow from poles."""
+        return any(study.control.has_poles for study in self.studies(parts))
 
-    def has_position_gain(self, law: str) -> bool:
-        """Whether any design of a law feeds back positions."""
-        if LAWS[law].has_position or self.has_poles(law):
+    def has_position_gain(self, parts: Parts) -> bool:
+        """Whether any such design feeds back positions."""
+        if LAWS[parts.law].has_position or self.has_poles(parts):
             return True
         if any("position_gain" in x for number in self.free.numbers for x in writes(number)):
             return True
-        return bool(np.any([study.control.position_gain for study in self.studies(law)]))
+        return bool(np.any([study.control.position_gain for study in self.studies(parts)]))
 
     @property
     def counted_links(self) -> tuple[int, ...]:
@@ -165,12 +174,6 @@ class TuneSpec(NamedTuple):
     def limit_names(self) -> tuple[str, ...]:
         """All limits, in the order used by evaluations."""
         return (*self.metric_limits, *self.loop_limits)
-
-
-def law_of(study: Study, columns: dict[str, Any]) -> str:
-    """Control law of a study with other values of some fields."""
-    law: str = columns.get("control.law", study.control.law)
-    return law
 
 
 def load_tuning(path: str | Path) -> TuneSpec:
@@ -203,7 +206,7 @@ def parse_tuning(data: dict[str, Any]) -> TuneSpec:
     _check_feedback(tune, study)
     scenarios = tune.scenarios
     check_varied(data, study, (*tune.free, *scenarios.each, *scenarios.spread, *scenarios.machines))
-    free = free_numbers(tune.free, study, _laws(tune, study))
+    free = free_numbers(tune.free, study, _parts(tune, study))
     moves = _moves(tune, study)
     families = _families(tune, study, free)
     _check_clashes(tune, free, families)
@@ -399,7 +402,7 @@ def _field(name: str) -> str:
 
 
 def _families(tune: Tune, study: Study, free: FreeNumbers) -> tuple[Family, ...]:
-    everything = np.array([not is_of_other_law(x.key, study.control.law) for x in free.numbers])
+    everything = np.array([parts_of(study).owns(x.key) for x in free.numbers])
     if not tune.families:
         families = [
             Family(name="tuned", is_free=everything, columns={}, limits=dict(tune.limits), front="")
@@ -454,25 +457,23 @@ def _family(name: str, written: Any, tune: Tune, study: Study, free: FreeNumbers
         known_field(field, study, f"{path}.set")
         columns[field] = checked_value(study, field, value, f"{path}.set.{shown_name(field)}")
     is_free = np.array([number.key in names for number in free.numbers])
-    law = law_of(study, columns)
-    is_other = np.array([is_of_other_law(number.key, law) for number in free.numbers])
+    parts = parts_of(study, columns)
+    is_other = np.array([not parts.owns(number.key) for number in free.numbers])
     for number, is_asked, is_wrong in zip(free.numbers, is_free, is_other, strict=True):
         if "free" in written and is_asked and is_wrong:
-            raise StudyError(f"{path}.free: {number.key!r}: the family's control.law is {law!r}")
+            raise StudyError(
+                f"{path}.free: {number.key!r}: the family's control.law is {parts.law!r}, its "
+                f"drive.kind {parts.drive!r}"
+            )
     is_free = is_free & ~is_other
     return Family(name=name, is_free=is_free, columns=columns, limits=dict(tune.limits), front="")
 
 
-def _laws(tune: Tune, study: Study) -> tuple[str, ...]:
-    """Control laws that designs have, each once."""
+def _parts(tune: Tune, study: Study) -> tuple[Parts, ...]:
+    """Laws and drives that designs have, each combination once."""
     changes = [x.get("set") for x in tune.families.values() if isinstance(x, dict)]
-    named = [x.get("control.law") for x in changes if isinstance(x, dict)]
-    return tuple(dict.fromkeys([study.control.law, *(x for x in named if x in LAWS)]))
-
-
-def is_of_other_law(field: str, law: str) -> bool:
-    """Whether a free field is a parameter of a law that is not this one."""
-    return field.startswith(f"{OWN_FIELDS}.") and not field.startswith(f"{OWN_FIELDS}.{law}.")
+    every = [parts_of(study), *(parts_of(study, x) for x in changes if isinstance(x, dict))]
+    return tuple(dict.fromkeys(x for x in every if x.law in LAWS and x.drive in DRIVES))
 
 
 def _front(tune: Tune, families: list[Family]) -> list[Family]:
@@ -522,7 +523,7 @@ def _check_family(family: Family, move: dict[str, Any], study: Study) -> None:
     except StudyError as error:
         raise StudyError(f"{prefix}{error}") from None
     structure, changed_structure = build_structure(study), build_structure(changed)
-    kept = {"law", "has_poles", "has_position_gain", "has_noise", "substeps"}
+    kept = {"law", "drive", "has_poles", "has_position_gain", "has_noise", "substeps"}
     for field, a, b in zip(structure._fields, structure, changed_structure, strict=True):
         if a != b and field not in kept:
             raise StudyError(

@@ -12,8 +12,11 @@ import jax
 import numpy as np
 
 from jaxmodel.case import Case, Drive, Structure
+from jaxmodel.drives import DRIVES
+from jaxmodel.drives.pd import PD
 from jaxmodel.simulate import begin
 from studies.engine.programs import kept_jit
+from studies.errors import field_error
 from studies.twin.multibody import STEP, Settings
 
 
@@ -62,7 +65,13 @@ def plan_run(structure: Structure, case: Case, settings: Settings, after: float)
         case: the numbers.
         settings: resolution.
         after: how long the run goes on after the reference trajectory [s].
+
+    Raises:
+        StudyError: the twin has no such drive.
     """
+    law = DRIVES[structure.drive]
+    if law.force is not PD.force:
+        raise field_error("drive.kind", law.name, "'pd' or 'computed_torque', which the twin knows")
     period = float(np.asarray(case.electronics.period))
     n_steps = settings.n_steps or 2 * max(round(period / (2 * STEP)), 1)
     begun = _begin(structure._replace(substeps=n_steps // 2), case)

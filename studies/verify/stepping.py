@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.drive import Reference
+from jaxmodel.drives import DRIVES
 from jaxmodel.dynamics import kinetic_energy, modal_chain, potential_energy
 from jaxmodel.integrator import exponential_step
 from jaxmodel.kinematics import inverse_kinematics
@@ -73,6 +74,7 @@ def _step(
 ) -> Stepped:
     """The plant over samples, each in `parts` steps: its path, or held where it starts."""
     loop: Loop = prepare(structure, case).loop
+    has_force = DRIVES[structure.drive].has_feedforward or structure.has_wrench
     period = case.electronics.period
     step = period / parts
     zeta = damping_ratio(case.machine.damping, loop.omega)
@@ -83,7 +85,7 @@ def _step(
         sample = sample_path(case.path, time * is_moving)
         rho, rate = inverse_kinematics(loop.plant, sample.position, sample.velocity * is_moving)
         wrench = case.load.wrench if structure.has_wrench else None
-        force = jnp.zeros(3) if structure.has_feedforward or structure.has_wrench else None
+        force = jnp.zeros(3) if has_force else None
         return Reference(
             rho=rho, rho_rate=rate, feedforward=force, disturbance=jnp.zeros(3), wrench=wrench
         )

@@ -1,0 +1,59 @@
+/* Drive of the sliders, see {{ name }}.h.
+ *
+{% for line in origin %}
+ * {{ line }}
+{% endfor %}
+ */
+#include "{{ name }}.h"
+
+#include <math.h>
+
+typedef {{ name }}_real real;
+#define R(x) ((real)(x))
+
+/* [N] of each motor, +-; drive.force_limit */
+const real {{ NAME }}_LIMIT{{ limit }};
+
+/* Of each slider, in SI units; [drive], and own_ fields of [drive.kinds] */
+{% for constant, values in constants %}
+static const real {{ constant }}{{ values }};
+{% endfor %}
+
+void {{ name }}_init({{ name }}_state *s)
+{
+    int i;
+
+    for (i = 0; i < 3; i++) {
+        s->force[i] = R(0.0);
+        s->memory[i] = R(0.0);
+    }
+}
+
+void {{ name }}_step({{ name }}_state *s, const real error[3], const real error_rate[3],
+                     const real feedforward[3], real feedback[3])
+{
+    int i;
+
+    for (i = 0; i < 3; i++) {
+        const real demand = feedforward[i] + s->force[i];
+        const real above = demand > {{ NAME }}_LIMIT[i] ? {{ NAME }}_LIMIT[i] : demand;
+        const real motor = above < -{{ NAME }}_LIMIT[i] ? -{{ NAME }}_LIMIT[i] : above;
+        const real applied = motor - feedforward[i];
+{% for line in force %}
+        {{ line }}
+{% endfor %}
+{% for line in memory %}
+        {{ line }}
+{% endfor %}
+
+        (void)applied;
+{% if memory %}
+        s->memory[i] = memory;
+{% endif %}
+        s->force[i] = force;
+        feedback[i] = force;
+    }
+    (void)kp;
+    (void)kd;
+    (void)force_limit;
+}

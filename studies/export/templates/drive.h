@@ -1,0 +1,48 @@
+/* Drive of the sliders of a planar 3-PRR robot: {{ text }}.
+ *
+{% for line in origin %}
+ * {{ line }}
+{% endfor %}
+ *
+ * Once per sample, at {{ NAME }}_RATE:
+ *   1. put on the motors the feed-forward plus the feedback of the last call, limited to
+ *      +-{{ NAME }}_LIMIT, and measure the sliders;
+ *   2. call {{ name }}_step; its feedback goes out at the next sample.
+ * That one sample of delay is part of the design. Begin with {{ name }}_init, feedback zero.
+ */
+#ifndef {{ NAME }}_H
+#define {{ NAME }}_H
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* double, or float with -D{{ NAME }}_REAL=float. */
+#ifndef {{ NAME }}_REAL
+#define {{ NAME }}_REAL double
+#endif
+typedef {{ NAME }}_REAL {{ name }}_real;
+
+#define {{ NAME }}_RATE {{ rate }} /* Hz */
+
+extern const {{ name }}_real {{ NAME }}_LIMIT[3]; /* N, of each motor, +- */
+
+typedef struct {
+    {{ name }}_real force[3];  /* N, feedback that acts during this sample */
+    {{ name }}_real memory[3]; /* of the law */
+} {{ name }}_state;
+
+/* At rest. */
+void {{ name }}_init({{ name }}_state *state);
+
+/* One sample: reference less measured position [m] and speed [m/s] of each slider, and the
+ * feed-forward that acts during this sample [N]; returns the feedback of the next one [N]. */
+void {{ name }}_step({{ name }}_state *state, const {{ name }}_real error[3],
+                     const {{ name }}_real error_rate[3], const {{ name }}_real feedforward[3],
+                     {{ name }}_real feedback[3]);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif
