@@ -11,11 +11,11 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure, with_ratio
 from jaxmodel.simulate import Result
+from studies.engine.distinct import judge_cases
 from studies.engine.executor import Executor, own_ratios
-from studies.engine.margins import judge_loops, no_margins
+from studies.engine.margins import no_margins
 from studies.engine.plan import Chunk, Group, Layout, chunk_cases, local_layout
 from studies.engine.progress import Reporter
-from studies.engine.robustness import judge_robustness
 from studies.engine.stability import LoopFigures
 from studies.kernels.compilation import compiler_time
 from studies.space.table import CaseTable
@@ -149,10 +149,10 @@ def start_chunk(
         own = signed_power(own_ratios(executor, cases), exponent)
         cases = with_ratio(cases, np.where(is_own[:, None, None], own, cases.control.ratio))
     before = compiler_time()
-    judge = judge_loops if is_judged else no_margins
-    margins = judge(executor.structure, cases)
-    more = judge_robustness(executor.structure, cases, robustness, margins.gain_margin)
-    margins = margins._replace(robustness=more)
+    if is_judged:
+        margins = judge_cases(executor.structure, cases, robustness)
+    else:
+        margins = no_margins(executor.structure, cases)._replace(robustness={})
     spent = compiler_time() - before
     running = executor.start(cases)
     if is_first:

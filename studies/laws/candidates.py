@@ -15,6 +15,8 @@ import numpy as np
 from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
+from jaxmodel.drives import DRIVES
+from jaxmodel.drives.contract import DriveLaw, drive_gains
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law
 from jaxmodel.parameters import Array
@@ -27,12 +29,18 @@ from studies.errors import StudyError
 from studies.study.paths import known_field, set_value
 from studies.study.spec import Study, parse_study
 
-#: Numbers are searched within this factor of their start, parameters inside their allowed range.
-REACH = 30.0
-GAIN = "control.gain_factor"
+#: Numbers are searched within this factor of their start, parameters inside their allowed range;
+#: those of drives, whose starts are stable, within a smaller one.
+REACH, SERVO = 100.0, 5.0
+#: Of the design's law, a candidate that keeps the design's ratios (24).
+AS_GIVEN = "ratios as given"
+GAIN, RATIOS = "control.gain_factor", "control.ratios"
+#: What laws are tuned for, and drives, which also have to follow the reference.
+OF_LAWS = {"residual_rms": 1.0}
+OF_DRIVES = {"residual_rms": 1.0, "pose_error_peak[0]": 0.5, "pose_error_peak[1]": 0.5}
 #: Settings that several laws share, and where they are searched.
 SHARED: dict[str, dict[str, Any]] = {
-    "control.ratios": {"from": 0.0, "to": 3.0},
+    RATIOS: {"from": 0.0, "to": 3.0},
     "electronics.highpass_hz": {"from": 5.0, "to": 200.0, "scale": "log"},
     "electronics.lowpass_ratio": {"from": 0.5, "to": 10.0, "scale": "log"},
 }
@@ -44,9 +52,10 @@ class Candidate(NamedTuple):
     """A law or a drive, and the numbers it is tuned by."""
 
     name: str  # in tables
-    law: str  # of LAWS
     settings: dict[str, Any]  # fields of the study that it sets
     free: dict[str, dict[str, Any]]  # ranges by field, as in `[tune.free]`
+    objective: dict[str, float]  # as in `[tune.objective]`
+    is_drive: bool = False
 
     def study(self, study: Study) -> Study:
         """The design with this candidate in place of its own."""
@@ -58,21 +67,28 @@ class Candidate(NamedTuple):
 def law_candidates(study: Study) -> list[Candidate]:
     """All laws for which a study needs no matrices of its own, the design's law among them.
 
+    Gains of modes also with the ratios (24) of the design, where they are all free otherwise.
+
     Args:
         study: the design, with sampled feedback.
     """
-    return [
-        _law_candidate(study, law)
-        for name, law in LAWS.items()
-        if name == study.control.law or name != "state_space"
-    ]
+    found = []
+    for name, law in LAWS.items():
+        if name != study.control.law and name == "state_space":
+            continue
+        one = _law_candidate(study, law)
+        found.append(one)
+        if RATIOS in one.free and name == study.control.law:
+            fixed = {field: x for field, x in one.free.items() if field != RATIOS}
+            found.append(one._replace(name=f"{law.text}, {AS_GIVEN}", free=fixed))
+    return found
 
 
 def _law_candidate(study: Study, law: Law) -> Candidate:
     settings: dict[str, Any] = {"control.law": law.name}
     if study.control.has_poles and not law.places_poles:
         settings |= {"control.damping": (), "control.pole_decay": ()}
-    plain = Candidate(law.text, law.name, settings, {})
+    plain = Candidate(law.text, settings, {}, OF_LAWS)
     own = plain.study(study)
     if law.channel == "patch" and law.name != study.control.law:  # its gains have another unit
         gains = np.array(study.control.velocity_gain) / _strength(*check_run(own))
@@ -84,16 +100,50 @@ def _law_candidate(study: Study, law: Law) -> Candidate:
     return plain._replace(free=free)
 
 
-def around(start: float, low: float = 0.0, high: float = np.inf) -> dict[str, Any]:
-    """The range within `REACH` of a positive start, inside what is allowed."""
-    return {"from": max(start / REACH, low), "to": min(start * REACH, high), "scale": "log"}
+def drive_candidates(study: Study) -> list[Candidate]:
+    """All drives, the design's among them.
+
+    Args:
+        study: the design.
+    """
+    return [_drive_candidate(study, law) for law in DRIVES.values()]
 
 
-def parameter_range(parameter: Parameter) -> dict[str, Any]:
-    """Where a law's parameter is searched."""
+def _drive_candidate(study: Study, law: DriveLaw) -> Candidate:
+    settings = {"drive.kind": law.name}
+    plain = Candidate(law.text, settings, {}, OF_DRIVES, is_drive=True)
+    own = plain.study(study)
+    gains = {"drive.kp": own.drive.kp, "drive.kd": own.drive.kd}
+    free = {name: around(x, share=SERVO) for name, x in gains.items() if _serves(own, name)}
+    for x in law.parameters:
+        free[f"drive.kinds.{law.name}.{x.name}"] = parameter_range(x, SERVO)
+    return plain._replace(free=free)
+
+
+def _serves(study: Study, name: str) -> bool:
+    """Whether the study's drive depends on one of its gains."""
+    value = known_field(name, study, "laws")
+    changed = parse_study(set_value(study, name, NUDGE * value))
+
+    def gains(one: Study) -> list[Any]:
+        structure, case = check_run(one)
+        return list(drive_gains(DRIVES[structure.drive], case.drive))
+
+    return any(not np.array_equal(a, b) for a, b in zip(gains(study), gains(changed), strict=True))
+
+
+def around(
+    start: float, low: float = 0.0, high: float = np.inf, share: float = REACH
+) -> dict[str, Any]:
+    """The range within a factor `share` of a positive start, inside what is allowed."""
+    return {"from": max(start / share, low), "to": min(start * share, high), "scale": "log"}
+
+
+def parameter_range(parameter: Parameter, share: float = REACH) -> dict[str, Any]:
+    """Where a parameter of a law or drive is searched."""
     if parameter.default <= 0:
         return {"from": parameter.low, "to": parameter.high}
-    return around(parameter.default, parameter.low, parameter.high)
+    return around(parameter.default, parameter.low, parameter.high, share)
 
 
 @kept_jit(static_argnums=0)

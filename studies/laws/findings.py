@@ -7,25 +7,38 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel import status
+from jaxmodel.laws import LAWS
 from studies.engine.controller import fixed_controller
 from studies.engine.preflight import check_run
 from studies.engine.stability import LoopFigures, loop_report
+from studies.errors import StudyError
 from studies.export.cost import products_of
-from studies.laws.judging import FIGURES, Judged
+from studies.laws.candidates import AS_GIVEN
+from studies.laws.judging import FIGURES, Judged, changes
 from studies.laws.ranking import Ranking, rank
 from studies.laws.tuning import Budget, Tuned
-from studies.study.spec import Study
+from studies.study.paths import set_value
+from studies.study.spec import Study, parse_study
 
 GIVEN, WITHOUT = "the design as given", "without control"
+
+
+class Entry(NamedTuple):
+    """A controller to compare."""
+
+    name: str  # in tables
+    law: str  # name of its candidate, "" for what was given
+    drive: str  # the same
+    study: Study
+    reason: str  # why it is out of the competition, "" if it is not
+    n_free: int  # numbers it was tuned by
 
 
 class Controller(NamedTuple):
     """One controller of the comparison."""
 
-    name: str
-    study: Study
+    entry: Entry
     reason: str  # why it is out of the competition, "" if it is not
-    n_free: int  # numbers it was tuned by
     loop: LoopFigures | None  # of its own machine; None without control
     products: int | None  # multiplications a sample; None without control
 
@@ -52,7 +65,7 @@ class LawFindings(NamedTuple):
 
     def name(self, place: int) -> str:
         """Name of a controller of the competition."""
-        return self.controllers[self.competing[place]].name
+        return self.controllers[self.competing[place]].entry.name
 
 
 def find(
@@ -82,23 +95,56 @@ def _complete(judged: Judged, figure: np.ndarray) -> np.ndarray:
     return np.where(np.isin(judged.status, status.FINISHED), figure, np.nan)
 
 
-def examine(name: str, study: Study, tuned: Tuned | None = None) -> Controller:
-    """A controller's loop on its own machine, and what a sample of it costs.
+def combinations(study: Study, tuned: list[Tuned]) -> list[Entry]:
+    """Every tuned law with every tuned drive.
+
+    Laws are tuned on the design's drive and drives with the design's law: the links see the drive
+    as what holds their sliders, and no combination is tuned by itself.
 
     Args:
-        name: in tables.
-        study: with this controller.
-        tuned: how it came about; None: it was given.
+        study: the design.
+        tuned: all candidates.
+
+    Raises:
+        StudyError: no law, or no drive, can be tuned.
     """
-    reason = tuned.reason if tuned is not None else "not tuned"
-    count = tuned.n_free if tuned is not None else 0
+    whole = [x for x in tuned if x.study is not None]
+    for is_drive in (False, True):
+        if not any(x.candidate.is_drive == is_drive for x in whole):
+            failed = next(x for x in tuned if x.candidate.is_drive == is_drive)
+            kind = "drive" if is_drive else "law"
+            raise StudyError(f"laws: no {kind} can be tuned; {failed.reason}")
+    laws, drives = ([x for x in whole if x.candidate.is_drive == kind] for kind in (False, True))
+    return [_combined(study, law, drive) for law in laws for drive in drives]
+
+
+def _combined(study: Study, law: Tuned, drive: Tuned) -> Entry:
+    assert law.study is not None and drive.study is not None
+    both = law.study
+    for name, value in changes(study, drive.study).items():
+        both = parse_study(set_value(both, name, value))
+    return Entry(
+        name=f"{law.candidate.name}; {drive.candidate.name}",
+        law=law.candidate.name,
+        drive=drive.candidate.name,
+        study=both,
+        reason="; ".join(filter(None, (law.reason, drive.reason))),
+        n_free=law.n_free + drive.n_free,
+    )
+
+
+def examine(entry: Entry) -> Controller:
+    """A controller's loop on its own machine, and what a sample of it costs."""
+    study = entry.study
     if not study.is_controlled:
-        return Controller(name, study, reason, count, None, None)
+        return Controller(entry, entry.reason, None, None)
     structure, case = check_run(study)
     pose = np.array(study.motion.waypoints[0], float)
     loop = loop_report(structure, case, pose, structure.n_controlled)
-    products = products_of(fixed_controller(study).channels)
-    return Controller(name, study, reason, count, loop, products)
+    reason = entry.reason
+    if not loop.is_stable:
+        reason = "; ".join(filter(None, (reason, "unstable")))
+    return Controller(entry, reason, loop, products_of(fixed_controller(study).channels))
 
 
 def verdict(findings: LawFindings) -> list[str]:
@@ -120,7 +166,24 @@ def verdict(findings: LawFindings) -> list[str]:
     if tied:
         lines.append(f"Not to be told from it on these machines: {', '.join(tied)}.")
     others = [_other(findings, name) for name in list(FIGURES)[1:]]
-    return [*lines, *filter(None, others)]
+    return [*lines, _own_law(findings), *filter(None, others)]
+
+
+def _own_law(findings: LawFindings) -> str:
+    """How far the design's own law is behind the best, with ratios as given and on any drive."""
+    ranking, entries = findings.ranking, findings.controllers
+    own = LAWS[findings.study.control.law].text
+    behind = []
+    for name in (f"{own}, {AS_GIVEN}", own):
+        places = [k for k, row in enumerate(findings.competing) if entries[row].entry.law == name]
+        places = [k for k in places if np.isfinite(ranking.ratio[k])]
+        if places:
+            k = min(places, key=lambda k: ranking.ratio[k])
+            what = f"{findings.name(k)} has {ranking.ratio[k]:.2f} times as much"
+            behind.append(f"{what} ({ranking.low[k]:.2f} to {ranking.high[k]:.2f})")
+    if not behind:
+        return f"The design's own law, {own}, does not keep the budget."
+    return f"Of the design's own law, at its best: {'; '.join(behind)}."
 
 
 def _other(findings: LawFindings, metric: str) -> str:

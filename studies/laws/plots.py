@@ -1,8 +1,9 @@
-"""The figure of a comparison: residual vibration, and how sure the order is."""
+"""Figures of a comparison: residual vibration and how sure the order is; laws against drives."""
 
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from studies.laws.findings import LawFindings
@@ -10,9 +11,12 @@ from studies.laws.judging import FIGURES
 from studies.show import figures
 from studies.show.units import readable
 
+#: Rows of a figure at most; the table has them all.
+MOST = 12
+
 
 def comparison(findings: LawFindings) -> Figure:
-    """Residual vibration of each controller on all machines, with the interval of its ratio.
+    """Residual vibration of the best controllers on all machines, with the intervals of ratios.
 
     Left: every machine and move, median marked. Right: the ratio to the best controller with its
     95 % interval, by each figure.
@@ -21,8 +25,8 @@ def comparison(findings: LawFindings) -> Figure:
         findings: of the comparison.
     """
     ranking, rows = findings.ranking, findings.competing
-    order = [k for k in ranking.order if np.isfinite(ranking.ratio[k])][::-1]  # the best on top
-    figure, axes = figures.new_figure(1, 2, max(1.6, 0.34 * len(order) + 0.6), False)
+    order = [k for k in ranking.order if np.isfinite(ranking.ratio[k])][:MOST][::-1]  # best on top
+    figure, axes = figures.new_figure(1, 2, max(1.6, 0.3 * len(order) + 0.6), False)
     left, right = axes[0]
     names = [findings.name(k) for k in order]
     factor, unit = readable("m")
@@ -53,4 +57,36 @@ def comparison(findings: LawFindings) -> Figure:
     right.set_yticks(range(len(order)), [])
     right.set_xlabel("over that of the best controller by this figure [1]")
     figures.legend_above(figure, right)
+    return figure
+
+
+def grid(findings: LawFindings) -> Figure:
+    """Median residual vibration and platform error of every law (rows) with every drive (columns).
+
+    Args:
+        findings: of the comparison.
+    """
+    entries = [controller.entry for controller in findings.controllers]
+    laws = list(dict.fromkeys(entry.law for entry in entries if entry.law))
+    drives = list(dict.fromkeys(entry.drive for entry in entries if entry.drive))
+    figure, axes = figures.new_figure(1, 2, max(1.6, 0.3 * len(laws) + 0.8), False)
+    factor, unit = readable("m")
+    titles = {"residual_rms": "residual rms", "pose_error_peak": "platform error while moving"}
+    for ax, (metric, title) in zip(axes[0], titles.items(), strict=True):
+        values = np.full((len(laws), len(drives)), np.nan)
+        for k, controller in enumerate(findings.controllers):
+            entry = controller.entry
+            if entry.law and not controller.reason:
+                place = laws.index(entry.law), drives.index(entry.drive)
+                values[place] = factor * np.median(findings.judged.metrics[metric][k])
+        if np.isfinite(values).any():
+            ax.imshow(values, norm=LogNorm(), cmap="viridis_r", aspect="auto")
+        for i, row in enumerate(values):
+            for j, value in enumerate(row):
+                text = f"{value:.3g}" if np.isfinite(value) else "-"
+                ax.text(j, i, text, ha="center", va="center", fontsize=figures.SMALL, color="w")
+        ax.set_xticks(range(len(drives)), drives, rotation=25, ha="right")
+        ax.set_yticks(range(len(laws)), laws if metric == "residual_rms" else [])
+        ax.set_title(f"{title}, median [{unit}]")
+        ax.grid(False)
     return figure

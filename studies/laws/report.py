@@ -85,7 +85,7 @@ def _row(findings: LawFindings, k: int) -> list[str]:
     margins = judged.gain_margin[k]
     has_margin = loop is not None and np.isfinite(margins).any()
     return [
-        controller.name,
+        controller.entry.name,
         number(values["residual_rms"], "m"),
         _ratio(findings, k),
         number(values["settling_time"], "s"),
@@ -95,7 +95,7 @@ def _row(findings: LawFindings, k: int) -> list[str]:
         margin_text(float(np.nanmin(margins))) if has_margin else "-",
         (loop.breaking or "-") if loop is not None else "-",
         "-" if controller.products is None else str(controller.products),
-        str(controller.n_free),
+        str(controller.entry.n_free),
         note or "-",
     ]
 
@@ -137,9 +137,11 @@ def _entry(findings: LawFindings, k: int) -> dict[str, Any]:
     controller, judged = findings.controllers[k], findings.judged
     rows = findings.competing
     entry: dict[str, Any] = {
-        "name": controller.name,
+        "name": controller.entry.name,
+        "law": controller.entry.law,
+        "drive": controller.entry.drive,
         "reason": controller.reason,
-        "numbers_tuned": controller.n_free,
+        "numbers_tuned": controller.entry.n_free,
         "products": controller.products,
         "gain_margin": _number(_over(judged.gain_margin[k], np.min)),
         "breaking": "" if controller.loop is None else controller.loop.breaking,

@@ -20,8 +20,17 @@ from studies.engine.runs import resolved_study
 from studies.engine.sweep import run_sweep, sweep_phases
 from studies.errors import StudyError, field_error
 from studies.laws import plots
-from studies.laws.candidates import law_candidates
-from studies.laws.findings import GIVEN, WITHOUT, LawFindings, examine, find, verdict
+from studies.laws.candidates import drive_candidates, law_candidates
+from studies.laws.findings import (
+    GIVEN,
+    WITHOUT,
+    Entry,
+    LawFindings,
+    combinations,
+    examine,
+    find,
+    verdict,
+)
 from studies.laws.judging import judging_sweep, machines_of, read_judged
 from studies.laws.report import document, report
 from studies.laws.tuning import Budget, Tuned, tune_candidate
@@ -114,22 +123,19 @@ def _empty_sweep(study: Study) -> SweepSpec:
 
 def _compare(study: Study, out: Path, budget: Budget, phases: Phases) -> LawFindings:
     tuned = _tune(study, out, budget, phases)
-    whole = [x for x in tuned if x.study is not None]
-    if not whole:
-        raise StudyError("laws: no candidate can be tuned; " + tuned[0].reason)
-    entries: list[tuple[str, Study, Tuned | None]] = [
-        (WITHOUT, study.uncontrolled(), None),
-        (GIVEN, study, None),
-        *((x.candidate.name, x.study, x) for x in whole if x.study is not None),
+    entries = [
+        Entry(WITHOUT, "", "", study.uncontrolled(), "not tuned", 0),
+        Entry(GIVEN, "", "", study, "not tuned", 0),
+        *combinations(study, tuned),
     ]
     machines = machines_of(study, MACHINES, budget.seed + 1)
-    spec = judging_sweep(study, [one for _, one, _ in entries], machines)
+    spec = judging_sweep(study, [entry.study for entry in entries], machines)
     is_begun = (out / RUNS).exists()
     if run_sweep(spec, out / RUNS, is_begun, phases=phases).is_interrupted:
         raise KeyboardInterrupt
     phases.begin("rank", "loops of the nominal machine")
     judged = read_judged(out / RUNS, len(entries), MACHINES)
-    controllers = [examine(*entry) for entry in entries]
+    controllers = [examine(entry) for entry in entries]
     findings = find(study, budget, tuned, judged, controllers)
     phases.begin("draw")
     _write(findings, out)
@@ -141,7 +147,8 @@ def _compare(study: Study, out: Path, budget: Budget, phases: Phases) -> LawFind
 def _tune(study: Study, out: Path, budget: Budget, phases: Phases) -> list[Tuned]:
     """Each candidate, tuned or not."""
     phases.begin("tune", "what each law and drive can be tuned by")
-    candidates, folder, tuned = law_candidates(study), out / TUNING, []
+    candidates = [*law_candidates(study), *drive_candidates(study)]
+    folder, tuned = out / TUNING, []
     folder.mkdir(exist_ok=True)
     for k, candidate in enumerate(candidates):
 
@@ -161,12 +168,13 @@ def _slug(name: str) -> str:
 def _write(findings: LawFindings, out: Path) -> None:
     with publish(out) as staging:
         for controller in findings.controllers[2:]:
-            file = staging / f"{_slug(controller.name)}.toml"
-            title = f"{findings.study.title or 'study'}: {controller.name}"[:200]
-            named = controller.study.model_copy(update={"title": title})
+            file = staging / f"{_slug(controller.entry.name)}.toml"
+            title = f"{findings.study.title or 'study'}: {controller.entry.name}"[:200]
+            named = controller.entry.study.model_copy(update={"title": title})
             file.write_text(study_template(named), encoding="utf-8")
         with styled():
             save(plots.comparison(findings), staging, "laws")
+            save(plots.grid(findings), staging, "grid")
             write_figure(sketch(findings.study), staging / "machine.png")
         described: dict[str, Any] = document(findings)
         (staging / DOCUMENT).write_text(json.dumps(described, indent=1), encoding="utf-8")

@@ -24,8 +24,6 @@ from studies.tuning.optimise import Progress, is_compatible, optimise
 from studies.tuning.run import make_evaluator
 from studies.tuning.spec import TuneSpec, parse_tuning
 
-#: What is minimised: the residual vibration of the controlled links.
-OBJECTIVE = "residual_rms"
 #: Spread of the machines, the same as those of `judging`: those there are others.
 SPREAD = {"link.stiffness_factor": 5.0, "machine.platform_mass": 20.0}
 #: The limit on the loop.
@@ -88,7 +86,7 @@ def tuning_of(study: Study, candidate: Candidate, budget: Budget) -> TuneSpec:
     """
     tune: dict[str, Any] = {
         "free": candidate.free,
-        "objective": {OBJECTIVE: 1.0},
+        "objective": candidate.objective,
         "limits": {"peak_voltage": budget.voltage, MARGIN: budget.margin},
         "families": {"tuned": {"set": candidate.settings}},
         "starts": budget.starts,
