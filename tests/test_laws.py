@@ -1,0 +1,138 @@
+"""`studies laws`: candidates, what they are judged on, and whether an order is certain."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from jaxmodel.drives import DRIVES
+from jaxmodel.laws import LAWS
+from studies.engine.distinct import distinct_loops, judge_cases
+from studies.engine.margins import judge_loops
+from studies.errors import StudyError
+from studies.laws import run as laws
+from studies.laws.candidates import AS_GIVEN, Candidate, drive_candidates, law_candidates
+from studies.laws.judging import MOVES, changes, judging_sweep, machines_of
+from studies.laws.ranking import rank
+from studies.laws.tuning import Budget, Tuned, make_budget, tuning_of
+from studies.space.table import build_table
+from studies.study.cases import build_cases, build_structure
+from studies.study.spec import paper_study
+from studies.study.window import with_window
+
+STUDY = with_window(paper_study().change(link__modes=4, run__duration=0.12, motion__move_time=0.05))
+STUDY = STUDY.change(
+    motion__waypoints=STUDY.motion.waypoints[:2],
+    metrics__residual_length=0.03,
+    shaper__kind="none",
+)
+
+
+def test_ratios_are_geometric_means_and_certain_ones_stay_apart():
+    rng = np.random.default_rng(0)
+    size = np.exp(rng.normal(size=(1, 40, 3)))  # of machine and move, the same for all
+    noise = np.exp(0.1 * rng.normal(size=(3, 40, 3)))
+    ranking = rank(size * noise * np.array([2.0, 1.0, 1.001]).reshape(3, 1, 1))
+    assert ranking.ratio[0] == pytest.approx(2.0, rel=0.05)
+    assert not ranking.is_tied[0] and ranking.low[0] > 1.8
+    assert ranking.is_tied[1] and ranking.is_tied[2]
+    assert ranking.share.sum() == pytest.approx(1.0) and ranking.share[0] == 0
+
+
+def test_an_interval_covers_the_true_ratio_as_often_as_it_says():
+    hits = 0
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        figure = np.exp(0.3 * rng.normal(size=(2, 25, 1))) * np.array([1.0, 1.5]).reshape(2, 1, 1)
+        ranking = rank(figure, seed)
+        hits += ranking.best == 0 and ranking.low[1] <= 1.5 <= ranking.high[1]
+    assert 88 <= hits <= 99  # 95 % of 100, and bootstrap intervals are a little short
+
+
+def test_a_lost_run_takes_a_controller_out():
+    ranking = rank(np.array([[[1.0], [np.nan]], [[2.0], [2.0]]]))
+    assert ranking.best == 1 and np.isnan(ranking.ratio[0]) and ranking.share[0] == 0
+    assert rank(np.full((2, 2, 1), np.nan)).best == -1
+
+
+def test_every_law_and_drive_is_a_candidate_with_valid_numbers():
+    found, drives = law_candidates(STUDY), drive_candidates(STUDY)
+    assert len(found) == len(LAWS)  # without state_space, with the design's law twice
+    assert [x.settings["drive.kind"] for x in drives] == list(DRIVES)
+    assert any(x.name.endswith(AS_GIVEN) for x in found)
+    for candidate in (*found, *drives):
+        spec = tuning_of(STUDY, candidate, Budget(50.0, 0.4))
+        (family,) = spec.moving
+        assert {spec.free.numbers[k].key for k in np.flatnonzero(family.is_free)} == set(
+            candidate.free
+        )
+
+
+def test_all_controllers_meet_the_same_machines_and_moves():
+    machines = machines_of(STUDY, 5, 1)
+    designs = [STUDY, STUDY.change(control__law="lqg"), STUDY.change(drive__kp=1e4)]
+    table = build_table(judging_sweep(STUDY, designs, machines))
+    assert len(table) == 3 * 5 * len(MOVES)
+    stiffness = table.columns["link.stiffness_factor"].reshape(3, 5, len(MOVES), 3)
+    np.testing.assert_array_equal(stiffness, np.broadcast_to(stiffness[:1], stiffness.shape))
+    assert np.all(np.abs(stiffness - 1) <= 0.05) and np.ptp(stiffness[0, :, 0]) > 0.05
+    mass = table.values("machine.platform_mass") / STUDY.machine.platform_mass
+    assert 0.8 <= mass.min() < mass.max() <= 1.2
+
+
+def test_changes_rebuild_a_design():
+    other = STUDY.change(
+        control__law="lqg", control__laws={"lqg": {"voltage_weight": 1e-7}}, drive__kd=50.0
+    )
+    assert changes(STUDY, other) == {
+        "control.law": "lqg",
+        "control.laws.lqg.voltage_weight": 1e-7,
+        "drive.kd": 50.0,
+    }
+
+
+def test_cases_that_differ_in_motion_alone_share_a_loop():
+    columns = {
+        "motion.move_time": np.array([0.05, 0.04, 0.05, 0.04]),
+        "control.gain_factor": np.array([0.5, 0.5, 1.0, 1.0]),
+        "run.seed": np.arange(4),
+    }
+    structure = build_structure(STUDY)
+    cases = build_cases(STUDY, columns, structure)
+    first, own = distinct_loops(cases)
+    np.testing.assert_array_equal(first, [0, 2])
+    np.testing.assert_array_equal(own, [0, 0, 1, 1])
+    whole = jax.tree.map(lambda x: np.broadcast_to(x, (4, *x.shape[1:])), cases)
+    found, wanted = judge_cases(structure, cases), judge_loops(structure, whole)
+    np.testing.assert_allclose(found.gain_margin, wanted.gain_margin, rtol=1e-6)
+    np.testing.assert_allclose(found.least_damping, wanted.least_damping, rtol=1e-6)
+
+
+def test_budget_from_the_command_line():
+    for bad in ({"voltage": -1.0}, {"voltage": 1e3}, {"margin": 2.5}, {"margin": float("nan")}):
+        with pytest.raises(StudyError, match=f"--{next(iter(bad))}"):
+            make_budget(STUDY, **({"voltage": 20.0, "margin": 0.4} | bad))
+
+
+def test_a_comparison_writes_a_page_whose_order_is_that_of_the_runs(tmp_path, monkeypatch):
+    factors = {"weak": 0.1, "strong": 0.6}
+    candidates = [
+        Tuned(Candidate(name, {}, {}, {}), STUDY.change(control__gain_factor=x), "", 1.0, 1, 8)
+        for name, x in factors.items()
+    ]
+    drive = Tuned(Candidate("PD", {}, {}, {}, is_drive=True), STUDY, "", 1.0, 2, 8)
+    monkeypatch.setattr(laws, "_tune", lambda *arguments: [*candidates, drive])
+    monkeypatch.setattr(laws, "MACHINES", 3)
+    findings = laws.run_laws(STUDY, tmp_path / "out", Budget(50.0, 0.4), is_quiet=True)
+    assert findings.name(findings.ranking.best) == "strong; PD"
+    document = json.loads((tmp_path / "out" / "laws.json").read_text())
+    names = [entry["name"] for entry in document["controllers"]]
+    assert names[:2] == ["strong; PD", "weak; PD"]
+    own = findings.judged.metrics["residual_rms"]
+    wanted = np.exp(np.log(own[2] / own[3]).mean())  # weak over strong, by the definition
+    weak = next(x for x in document["controllers"] if x["name"] == "weak; PD")
+    assert weak["ratio"]["residual_rms"][0] == pytest.approx(wanted)
+    assert "strong; PD" in (tmp_path / "out" / "report.html").read_text()
+    with pytest.raises(StudyError, match="another design, budget or program"):
+        laws.run_laws(STUDY, tmp_path / "out", Budget(40.0, 0.4), is_resumed=True, is_quiet=True)
