@@ -16,7 +16,11 @@ from jaxmodel.riccati import filter_gain, regulator_gain, solve_riccati
 from jaxmodel.sampled_loop import closed_loop
 from jaxmodel.simulate import simulate
 from jaxmodel.state_space import StateSpace, dense
+from studies.engine.executor import Executor
+from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.stability import loop_report, with_margin_modes
+from studies.space.spec import parse_sweep
+from studies.space.table import build_table
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import parse_study
 
@@ -300,3 +304,20 @@ def test_gain_factors_do_not_change_what_limits_tell():
     one = np.asarray(system.feedback.anti_windup)
     np.testing.assert_allclose(system.feedback.amplified(2.0).anti_windup, one / 2)
     assert not np.any(np.asarray(system.feedback.amplified(0.0).anti_windup))
+
+
+@pytest.mark.parametrize("law", ["lqg", "observer"])
+def test_kernel_is_scan_at_the_limits(law):
+    """Peak and residual to 1e-9, with commands limited to 2 V."""
+    data = SHORT | {"control": {"law": law, "modes": 1}, "electronics": {"voltage_limit": 2.0}}
+    table = build_table(parse_sweep(data | {"sweep": {"axes": {"gain": [0.7, 1.0]}}}))
+    group = plan_groups(table, np.arange(2), local_layout)[0]
+    structure = group.structure._replace(metrics=("residual_rms", "peak_voltage"))
+    cases = chunk_cases(table, group.rows, structure, group.layout.size)
+    one, other = (
+        Executor(structure, group.layout, kind=name).start(cases).wait()
+        for name in ("kernel", "scan")
+    )
+    assert np.max(one.metrics.peak_voltage) == 2
+    for name in structure.metrics:
+        np.testing.assert_allclose(other.metrics[name], one.metrics[name], rtol=1e-9)

@@ -90,7 +90,13 @@ def _to_pairs(system: StateSpace, group: int) -> StateSpace:
         raise StudyError(f"the controller has {error}") from None
     enter = form.enter[None, ..., :size]
     tell = None if tell is None else form.enter[None, ..., size:]
-    return StateSpace(form.state[None], enter, form.leave[None], d[None], tell)
+    return StateSpace(
+        state=form.state[None],
+        enter=enter,
+        leave=form.leave[None],
+        direct=d[None],
+        anti_windup=tell,
+    )
 
 
 def _stack_groups(parts: list[StateSpace]) -> StateSpace:
