@@ -188,12 +188,13 @@ def prove_box(design: FixedController, law: Controller, seconds: float) -> Prove
     Args:
         design: with its plant.
         law: see `pad_channels`.
-        seconds: at most.
+        seconds: at most, after compilation.
     """
-    start = time.monotonic()
     basis = design.study.link.basis
     has_tail = basis == SINES
-    nothing = ProvenBox(BOX, 1.0, has_tail, LARGEST, 0, 0.0)
+    nothing = ProvenBox(
+        ranges=BOX, undecided=1.0, has_all_modes=has_tail, n_base=LARGEST, cells=0, seconds=0.0
+    )
     if not BASES[basis].is_on_chord:
         return nothing._replace(fault=f"{basis}: its modes move the far ends of the links")
     if design.structure.has_wrench and not has_tail:
@@ -212,6 +213,7 @@ def prove_box(design: FixedController, law: Controller, seconds: float) -> Prove
     ranges = np.array([*BOX[:2], _payload(design, BOX[2][1]), (1.0, 1.0)])
     cells = start_cells(setup, ranges, SLICES)
     smallest = SMALLEST * [cells.high[-1, 0], 1, 1, 1, 1]
+    start = time.monotonic()
     found = exclude_zeros(
         setup, cells, smallest, BOX_CELLS, lambda: time.monotonic() - start > seconds
     )
