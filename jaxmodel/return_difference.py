@@ -16,7 +16,7 @@ import numpy as np
 from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.estimator import Estimator
-from jaxmodel.frequency_response import plant_response
+from jaxmodel.frequency_response import PlantResponse, plant_response
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import Loop
 from jaxmodel.pairs import Pair, determinant, product
@@ -165,7 +165,7 @@ class AssembledModes(NamedTuple):
     growth: Array  # growth rate of an unstable rest, 0: stable [1/s], ()
 
 
-def assembled_modes(response: LoopResponse) -> AssembledModes:
+def assembled_modes(response: LoopResponse | PlantResponse) -> AssembledModes:
     """Natural modes of pose and links: one symmetric eigenvalue problem.
 
     With modal masses 1 the mass matrix is (1 G'; G M) and its Cholesky factor (1 0; G C),

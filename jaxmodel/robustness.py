@@ -24,6 +24,7 @@ from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 from jaxmodel.return_difference import NARROWEST, assembled_modes
 from jaxmodel.scaling import best_scaling, scaled
+from jaxmodel.state_space import StateSpace
 
 #: Lower limits of a loop, 0: it is unstable; upper ones, its largest singular values.
 MARGINS = ("disk_margin", "phase_margin", "delay_margin")
@@ -110,13 +111,19 @@ def guaranteed_range(disk_margin: Array) -> tuple[Array, Array]:
 
 
 def search_frequencies(response: SampledLoopResponse) -> Array:
-    """Rising, from `LOWEST_HZ` to half the sample rate, dense beside the modes [rad/s], (F,)."""
+    """Rising [rad/s], dense beside the modes of the machine and of a controller, (F,)."""
     plant = response.plant
     modes, top = assembled_modes(plant), np.pi / plant.period
     lowest = 2 * np.pi * LOWEST_HZ
     background = lowest * (top / lowest) ** np.linspace(0, 1, BACKGROUND)
-    width = jnp.maximum(modes.decay, NARROWEST * modes.omega)
-    beside = modes.omega + BESIDE[:, None] * width
+    centre, decay = modes.omega, modes.decay
+    if isinstance(response.controller.feedback, StateSpace):
+        pole = jnp.linalg.eigvals(response.controller.feedback.state)
+        rate = jnp.log(jnp.maximum(jnp.abs(pole), 1e-9)) / plant.period
+        centre = jnp.concatenate([centre, jnp.ravel(jnp.abs(jnp.angle(pole)) / plant.period)])
+        decay = jnp.concatenate([decay, jnp.ravel(jnp.abs(rate))])
+    width = jnp.maximum(decay, NARROWEST * centre)
+    beside = centre + BESIDE[:, None] * width
     folded = jnp.abs((beside + top) % (2 * top) - top)  # after aliasing
     omega = jnp.concatenate([background, jnp.ravel(folded)])
     return jnp.sort(jnp.clip(omega, lowest, top * (1 - 1e-6)))
@@ -285,19 +292,6 @@ def _first_crossing(
         first, number = jax.lax.top_k(-jnp.ravel(at), CELLS)
         return -first, jnp.ravel(omega)[number], number
 
-    def advance(state: tuple[Array, ...]) -> tuple[Array, ...]:
-        return state[0] + 1, *cells(state[0])
-
-    nothing = jnp.full(CELLS, jnp.inf), jnp.ones(CELLS), jnp.zeros(CELLS, jnp.int32)
-    begin = jnp.where(strong.is_any, 0, n_parts), *nothing
-    _, start, near, number = jax.lax.while_loop(
-        lambda state: (state[0] < n_parts) & jnp.isinf(state[1][0]), advance, begin
-    )
-    column = number % (strong.omega.size - 1)
-    width = strong.omega[column + 1] - strong.omega[column]
-    width = jnp.where(width > 0, width, 1.0)
-    sign = jnp.asarray(signs)[number // (strong.omega.size - 1) % len(signs)]
-
     def guesses(cell: tuple[Array, ...]) -> tuple[Array, Array]:
         """Several eigenvalues can reach -1 in one cell: where each does by its derivatives."""
         start, near, width, sign = cell
@@ -317,7 +311,7 @@ def _first_crossing(
         near, start, width, sign = guess
 
         def newton(_: int, at: tuple[Array, ...]) -> tuple[Array, ...]:
-            w, t, *_ = at
+            w, t = at[:2]
             value, by_w, by_t = _with_slopes(
                 lambda w, t: _determinant(exact(fixed, w, t, sign)), w, t
             )
@@ -326,24 +320,50 @@ def _first_crossing(
             return w + dw, t + dt, jnp.abs(dt) / step + jnp.abs(dw) / width, by_w, by_t
 
         begin = near, start, jnp.inf, 0j * near, 0j * near
-        w, t, last, *slopes = jax.lax.fori_loop(0, NEWTON, newton, begin)
+        w, t, last, by_w, by_t = jax.lax.fori_loop(0, NEWTON, newton, begin)
         is_there = (jnp.abs(t - start) < 3 * step) & (t > 0) & (last < 1e-6)
-        return w, jnp.where(is_there, t, jnp.inf), *slopes
+        return w, jnp.where(is_there, t, jnp.inf), by_w, by_t
 
-    near, first = map(jnp.ravel, jax.lax.map(guesses, (start, near, width, sign)))
-    width, sign = jnp.repeat(width, EACH), jnp.repeat(sign, EACH)
-    w, t, by_w, by_t = jax.lax.map(polished, (near, first, width, sign))
-    t = jnp.where(jnp.repeat(jnp.isinf(start), EACH), jnp.inf, t)
-    best = jnp.argmin(t)
-    has_one = jnp.isfinite(t[best])
-    # where Newton's iteration has lost the zero: its first guess
-    value = jnp.where(has_one, t[best], jnp.minimum(start[0], most))
-    at = jnp.where(has_one, w[best], strong.omega[0]), jnp.where(has_one, t[best], step)
-    moved = _determinant(exact(response, *at, sign[best]))
+    def confirmed(start: Array, near: Array, number: Array) -> tuple[Array, ...]:
+        """The zero of smallest t among those cells: t, omega, sign and slopes there."""
+        column = number % (strong.omega.size - 1)
+        width = strong.omega[column + 1] - strong.omega[column]
+        width = jnp.where(width > 0, width, 1.0)
+        sign = jnp.asarray(signs)[number // (strong.omega.size - 1) % len(signs)]
+        near, first = map(jnp.ravel, jax.lax.map(guesses, (start, near, width, sign)))
+        width, sign = jnp.repeat(width, EACH), jnp.repeat(sign, EACH)
+        w, t, by_w, by_t = jax.lax.map(polished, (near, first, width, sign))
+        t = jnp.where(jnp.repeat(jnp.isinf(start), EACH), jnp.inf, t)
+        best = jnp.argmin(t)
+        return t[best], w[best], sign[best], by_w[best], by_t[best]
+
+    real, whole = strong.omega.dtype, strong.images.dtype
+    nothing = (
+        jnp.array(jnp.inf, real),
+        strong.omega[0],
+        jnp.ones((), real),
+        jnp.zeros((), whole),
+        jnp.zeros((), whole),
+    )
+
+    def advance(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        found = cells(state[0])
+        # a cell may seem to hold a zero where the map is too coarse: those are passed over
+        zero = jax.lax.cond(jnp.isinf(found[0][0]), lambda *_: nothing, confirmed, *found)
+        return state[0] + 1, *zero
+
+    _, t, w, sign, by_w, by_t = jax.lax.while_loop(
+        lambda state: (state[0] < n_parts) & jnp.isinf(state[1]),
+        advance,
+        (jnp.where(strong.is_any, 0, n_parts), *nothing),
+    )
+    has_one = jnp.isfinite(t)
+    at = jnp.where(has_one, w, strong.omega[0]), jnp.where(has_one, t, step)
+    moved = _determinant(exact(response, *at, sign))
     # safe numbers where there is none, or gradients would not be numbers
-    slopes = jnp.where(has_one, by_w[best], 1.0), jnp.where(has_one, by_t[best], 1j)
+    slopes = jnp.where(has_one, by_w, 1.0), jnp.where(has_one, by_t, 1j)
     slope = jnp.where(has_one, _solve(moved, *slopes)[1], 0.0)
-    return jnp.minimum(value + slope - jax.lax.stop_gradient(slope), most)
+    return jnp.minimum(jnp.minimum(t, most) + slope - jax.lax.stop_gradient(slope), most)
 
 
 def _determinant(gain: Array) -> Array:

@@ -27,10 +27,18 @@ from jaxmodel.robustness import (
 from jaxmodel.sampled_loop import _with_electronics, closed_loop
 from jaxmodel.scaling import best_scaling, scaled
 from studies.engine.margins import judge_loops
+from studies.engine.results import read_sweep
 from studies.engine.robustness import judge_robustness
 from studies.engine.stability import with_margin_modes
+from studies.engine.sweep import run_sweep
+from studies.errors import StudyError
+from studies.space.spec import parse_sweep
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure
 from studies.study.spec import paper_study
+from studies.sweeps.show import ranked_cases
+from studies.tuning import linear_fidelity
+from studies.tuning.linear_fidelity import LinearFidelity
+from tests.tunings import EVERY_KIND, GAIN, SMALL, tuning
 
 #: Off home, where nothing is symmetric.
 POSE = np.array([0.005, -0.003, 0.5])
@@ -171,7 +179,13 @@ _ANALOGUES: dict[int, _Analogue] = {}
 LOOPS = {"imsc": 0.5, "lqr": 0.5, "srf": 2e-4, "ppf": 0.5, "observer": 0.5, "lqg": 0.5}
 
 
-@pytest.mark.parametrize("law", LOOPS)
+#: Laws of the quick tests; each form of a controller compiles a program of its own.
+QUICK = ("imsc", "lqr")
+
+
+@pytest.mark.parametrize(
+    "law", [pytest.param(x, marks=[] if x in QUICK else pytest.mark.long) for x in LOOPS]
+)
 def test_margins_are_where_a_pole_reaches_the_circle(law):
     """Commands turned, or late by exact discretisation: stable before, at the edge there."""
     loop = loop_of("plain", law, LOOPS[law])
@@ -291,6 +305,7 @@ def test_peaks_are_those_of_singular_values(name):
     assert found == pytest.approx(-best.fun, rel=1e-6)
 
 
+@pytest.mark.long
 def test_gradients_are_those_of_differences():
     """By gains, drive, placement and delay of all figures."""
     loop = loop_of("plain", "lqr", LOOPS["lqr"])
@@ -317,14 +332,15 @@ def test_gradients_are_those_of_differences():
         np.testing.assert_allclose(slope[:, k], wanted, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("law", "patches", "links"),
     [
         ("imsc", 1, (True, False, False)),
         ("srf", 5, (True, True, False)),
         pytest.param("modified_imsc", 3, (True, True, True)),
-        pytest.param("lqg", 5, (False, True, True), marks=pytest.mark.long),
-        pytest.param("observer", 2, (True, True, True), marks=pytest.mark.long),
+        pytest.param("lqg", 5, (False, True, True)),
+        pytest.param("observer", 2, (True, True, True)),
     ],
 )
 def test_every_law_is_judged(law, patches, links):
@@ -355,3 +371,52 @@ def test_what_a_disk_margin_guarantees():
     gain, phase = guaranteed_range(np.array([0.0, 1.0, 2.0]))
     np.testing.assert_allclose(gain, [0.0, 20 * np.log10(3.0), np.inf])
     np.testing.assert_allclose(phase, [0.0, 2 * np.rad2deg(np.arctan(0.5)), 90.0])
+
+
+@pytest.mark.long
+def test_limits_of_tunings_have_the_gradients_of_differences(monkeypatch):
+    """Of every figure, also of an unstable design, whose limits are violated."""
+    monkeypatch.setattr(linear_fidelity, "MARGIN_MODES", 4)
+    limits = {
+        "disk_margin": 0.8,
+        "phase_margin": 40.0,
+        "delay_margin": 1.0,
+        "sensitivity_peak": 1.5,
+        "control_effort_peak": 20.0,
+        "disturbance_deflection_peak": 5e-5,
+    }
+    spec = tuning({**GAIN, "drive.kp": EVERY_KIND["drive.kp"]}, limits=limits)
+    linear = LinearFidelity(spec, [spec.families[0]] * 4)
+    steps = np.array([[0.0, 0.0], [1e-5, 0.0], [-1e-5, 0.0]])
+    designs = np.concatenate([[0.4, 2e4] * (1 + steps), [[2.0, 2e4]]])
+    excess, slopes = linear.limits(designs)
+    wanted = (excess[1] - excess[2]) / (designs[1, 0] - designs[2, 0])
+    np.testing.assert_allclose(slopes[0, :, 0], wanted, rtol=1e-4, atol=1e-6)
+    assert np.isfinite(slopes).all()
+    assert (excess[3] > 0).all()
+
+
+@pytest.mark.long
+def test_a_sweep_keeps_the_figures_that_it_names(tmp_path):
+    data = dict(SMALL) | {
+        "sweep": {
+            "axes": {"control.gain_factor": [0.1, 0.3]},
+            "metrics": ["residual_rms"],
+            "robustness": ["disk_margin", "sensitivity_peak"],
+        }
+    }
+    run_sweep(parse_sweep(data), tmp_path / "sweep")
+    found = read_sweep(tmp_path / "sweep")
+    assert "phase_margin" not in found.variables
+    assert (np.diff(found["disk_margin"]) < 0).all()
+    assert (found["sensitivity_peak"] > 1).all()
+    best = ranked_cases(found, "disk_margin", "sensitivity_peak > 1")
+    assert list(best) == [0, 1]
+
+
+def test_figures_that_no_sweep_has_are_named():
+    data = dict(SMALL) | {
+        "sweep": {"axes": {"control.modes": [1, 2]}, "robustness": ["disc_margin"]}
+    }
+    with pytest.raises(StudyError, match="sweep.robustness = 'disc_margin'.*disk_margin"):
+        parse_sweep(data)

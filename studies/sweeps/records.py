@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxmodel import status
-from studies.engine.columns import NOT_RUN, PER_CASE
+from studies.engine.columns import NOT_RUN, ON_DEMAND, PER_CASE
 from studies.engine.results import SweepData, metric_values, swept_names
 from studies.sweeps.environments import design_values
 
@@ -20,7 +20,7 @@ from studies.sweeps.environments import design_values
 Record = dict[str, Any]
 MARGIN = "gain_margin"
 #: Stand next to every metric of the cases that have them: what a design costs, and how safe it is.
-BESIDE = ("peak_voltage", "damping_ratio[controlled_mode=1]", MARGIN)
+BESIDE = ("peak_voltage", "damping_ratio[controlled_mode=1]", MARGIN, *ON_DEMAND)
 
 
 def reason(code: int) -> str:
