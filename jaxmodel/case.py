@@ -35,6 +35,7 @@ class Structure(NamedTuple):
     has_feedforward: bool = False  # computed torque on top of PD
     has_sensor_highpass: bool = False  # patches drained by their amplifiers' inputs
     has_amplifier: bool = False  # actuators behind amplifiers of finite bandwidth
+    has_delay: bool = False  # commands arrive later or earlier than after one sample
     has_noise: bool = False  # seeded ADC noise and force ripple
     has_friction: bool = False  # Coulomb friction on the sliders
     has_poles: bool = False  # gains follow from poles
@@ -42,6 +43,16 @@ class Structure(NamedTuple):
     metrics: tuple[str, ...] = ()  # to accumulate; (): all of them
     is_linear: bool = False  # mechanics to first order about rest at the last way-point
     is_smooth: bool = False  # for gradients: noise instead of rounding, limits with round corners
+
+    @property
+    def is_delayed(self) -> bool:
+        """Whether commands change within samples."""
+        return self.has_delay and self.feedback == "sampled"
+
+    @property
+    def plant_steps(self) -> int:
+        """Plant steps in a sample: `substeps`, before and after a command changes."""
+        return self.substeps * (2 if self.is_delayed else 1)
 
 
 class Control(NamedTuple):
@@ -71,6 +82,8 @@ class Electronics(NamedTuple):
     antialias: Array  # corner of the Butterworth filter [rad/s], ()
     sensor_highpass: Array  # corner 1/(R C) of a patch into its amplifier [rad/s], ()
     amplifier_lag: Array  # time constant of the actuators' amplifiers [s], ()
+    delay: Array  # from a sample to its command on the actuators [samples], ()
+    unmodelled_delay: Array  # more of it, which the controller does not know [samples], ()
     conditioner_gain: Array  # ADC volt per sensor volt [1], ()
     conditioner_bias: Array  # [V], ()
     adc_range: Array  # full scale, from 0 [V], ()

@@ -13,17 +13,18 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.control import active_modes, condition_number, left_inverse
 from jaxmodel.controller import Controller, Feedback, with_gains
+from jaxmodel.delay import command_change, true_delay
 from jaxmodel.drive import Reference
 from jaxmodel.dynamics import inverse_dynamics
-from jaxmodel.electronics import design_amplifier, voltage_passage
+from jaxmodel.electronics import Amplifier, design_amplifier, voltage_passage
 from jaxmodel.estimator import KINDS
-from jaxmodel.integrator import exponential_step
+from jaxmodel.integrator import Exponential, exponential_step
 from jaxmodel.kinematics import close_chain
 from jaxmodel.laws import LAWS, is_modal, n_channels
 from jaxmodel.laws.contract import NominalModel, check_feedback
 from jaxmodel.laws.poles import is_unplaceable
 from jaxmodel.lazy import jax, jnp
-from jaxmodel.loop import LeftOut, Loop, Rest
+from jaxmodel.loop import Delayed, LeftOut, Loop, Rest
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import (
     actuator_constant,
@@ -87,23 +88,17 @@ def prepare(structure: Structure, case: Case) -> Prepared:
     omega = jnp.sqrt(basis.stiffness / basis.mass)
     zeta = plant.damping / (2 * basis.mass * omega)
     step = electronics.period / structure.substeps
+    change = command_change(true_delay(electronics)) if structure.is_delayed else None
+    after = step if change is None else (1 - change.share) * step
     lambda_s, lambda_a = _constants(case)
     sensor = lambda_s[:, None, None] * jnp.swapaxes(basis.sensor_slope, 1, 2)
     angle = 2 * jnp.pi * electronics.period * spectrum_frequencies(structure, bases)
     loop = Loop(
         plant=plant,
         omega=omega,
-        exponential=exponential_step(
-            omega,
-            zeta,
-            step,
-            electronics.antialias,
-            electronics.sensor_highpass if structure.has_sensor_highpass else None,
-        ),
-        plant_step=step,
-        amplifier=(
-            design_amplifier(step, electronics.amplifier_lag) if structure.has_amplifier else None
-        ),
+        exponential=_exponential(structure, case, omega, zeta, after),
+        plant_step=after,
+        amplifier=_amplifier(structure, case, after),
         sensor=sensor,
         actuator=lambda_a[:, None, None] * basis.actuator_slope / basis.mass[:, :, None],
         deflection_at=basis.deflection_at,
@@ -120,9 +115,20 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         ),
         axial_compliance=axial_compliance(machine.beam),
         settling_band=jnp.asarray(case.windows.settling_band),
-        left_out=_left_out(structure, case, basis, step),
+        left_out=_left_out(structure, case, basis, after),
         rest=_rest(structure, case, plant) if structure.is_linear else None,
     )
+    if change is not None:
+        until = change.share * step
+        delayed = Delayed(
+            before=change.before,
+            after=change.after,
+            exponential=_exponential(structure, case, omega, zeta, until),
+            plant_step=until,
+            amplifier=_amplifier(structure, case, until),
+            passage=_passage(structure, case, until) if structure.has_static_correction else None,
+        )
+        loop = loop._replace(delayed=delayed)
     return Prepared(
         loop=loop,
         bases=bases,
@@ -134,22 +140,46 @@ def prepare(structure: Structure, case: Case) -> Prepared:
     )
 
 
+def _exponential(
+    structure: Structure, case: Case, omega: Array, zeta: Array, step: Array
+) -> Exponential:
+    electronics = case.electronics
+    return exponential_step(
+        omega,
+        zeta,
+        step,
+        electronics.antialias,
+        electronics.sensor_highpass if structure.has_sensor_highpass else None,
+    )
+
+
+def _amplifier(structure: Structure, case: Case, step: Array) -> Amplifier | None:
+    if not structure.has_amplifier:
+        return None
+    return design_amplifier(step, case.electronics.amplifier_lag)
+
+
+def _passage(structure: Structure, case: Case, step: Array) -> Array | None:
+    """See `LeftOut`."""
+    if structure.feedback != "sampled":
+        return None
+    electronics = case.electronics
+    return voltage_passage(
+        step,
+        electronics.antialias,
+        electronics.sensor_highpass if structure.has_sensor_highpass else None,
+        electronics.amplifier_lag if structure.has_amplifier else None,
+    )
+
+
 def _left_out(structure: Structure, case: Case, basis: ModalBasis, step: Array) -> LeftOut | None:
     """Static response of the modes that the plant leaves out."""
     if not structure.has_static_correction:
         return None
-    electronics, passage = case.electronics, None
-    if structure.feedback == "sampled":
-        passage = voltage_passage(
-            step,
-            electronics.antialias,
-            electronics.sensor_highpass if structure.has_sensor_highpass else None,
-            electronics.amplifier_lag if structure.has_amplifier else None,
-        )
     return LeftOut(
         sensor=_left_out_voltage(case, basis),
         deflection=left_out_deflection(case, basis),
-        passage=passage,
+        passage=_passage(structure, case, step),
     )
 
 

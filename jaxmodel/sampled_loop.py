@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, controller_step, rest_controller, with_gains
+from jaxmodel.delay import LONGEST, command_change, true_delay
 from jaxmodel.electronics import FASTEST
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.linear import LinearPlant, Moment, linearise, resting
@@ -75,17 +76,19 @@ def loop_matrices(
     smooth = structure._replace(is_smooth=True, feedback="sampled")
     plant = linearise(smooth, loop, pose, moment)
     analogue = _with_electronics(smooth, plant, case)
-    exact = _over_a_sample(analogue, case.electronics.period)
+    exact = _over_a_sample(smooth, analogue, case)
     from jax.flatten_util import ravel_pytree
 
-    n, n_sensors = len(exact), 3 * structure.n_patches
+    n = len(exact.held)
     rest, unpack = ravel_pytree(rest_controller(law))
 
     def advance(x: Array, factor: Array) -> Array:
         before = unpack(x[n:])
         filtered = jnp.reshape(x[analogue.filtered], before.voltage.shape)
         after, _ = controller_step(with_gains(law, factor), before, filtered, None, True)
-        moved = exact[:, : n + n_sensors] @ jnp.concatenate([x[:n], jnp.ravel(before.voltage)])
+        moved = exact.held @ jnp.concatenate([x[:n], jnp.ravel(before.voltage)])
+        if exact.newest is not None:
+            moved = moved + exact.newest @ jnp.ravel(after.voltage)
         return jnp.concatenate([moved, ravel_pytree(after)[0]])
 
     start = jnp.concatenate([jnp.zeros((n,), analogue.state.dtype), rest])
@@ -93,9 +96,10 @@ def loop_matrices(
     without = jacobian(start, 0.0)
 
     def deflected(x: Array) -> Array:
-        voltage = (
-            jnp.ravel(unpack(x[n:]).voltage) if analogue.voltage is None else x[analogue.voltage]
-        )
+        if analogue.voltage is not None:
+            voltage = x[analogue.voltage]
+        else:
+            voltage = exact.present @ jnp.concatenate([x[:n], jnp.ravel(unpack(x[n:]).voltage)])
         bent = plant.deflection @ x[: plant.deflection.shape[1]]
         return bent + plant.direct_deflection @ voltage
 
@@ -103,7 +107,7 @@ def loop_matrices(
         open=without,
         feedback=jacobian(start, 1.0) - without,
         plant=plant.state,
-        force=jnp.pad(exact[:, n + n_sensors :], ((0, start.size - n), (0, 0))),
+        force=jnp.pad(exact.force, ((0, start.size - n), (0, 0))),
         deflection=jax.jacfwd(deflected)(start),
     )
 
@@ -137,14 +141,14 @@ def sampled_plant(structure: Structure, case: Case, pose: Array) -> SampledPlant
     analogue = _with_electronics(
         smooth, linearise(smooth, loop, pose, resting(structure, case)), case
     )
-    exact = _over_a_sample(analogue, case.electronics.period)
-    n, n_sensors = len(exact), 3 * structure.n_patches
-    eye = jnp.eye(n_sensors, dtype=exact.dtype)
-    held = jnp.pad(exact[:, : n + n_sensors], ((0, n_sensors), (0, 0)))
+    exact = _over_a_sample(smooth, analogue, case)
+    n, n_sensors = len(exact.held), 3 * structure.n_patches
+    eye = jnp.eye(n_sensors, dtype=exact.held.dtype)
+    enter = jnp.pad(eye, ((n, 0), (0, 0)))
     return SampledPlant(
-        state=held,
-        enter=jnp.pad(eye, ((n, 0), (0, 0))),
-        leave=jnp.zeros((n_sensors, n + n_sensors), exact.dtype).at[:, analogue.filtered].set(eye),
+        state=jnp.pad(exact.held, ((0, n_sensors), (0, 0))),
+        enter=enter if exact.newest is None else enter.at[:n].set(exact.newest),
+        leave=jnp.zeros((n_sensors, n + n_sensors), eye.dtype).at[:, analogue.filtered].set(eye),
     )
 
 
@@ -158,8 +162,52 @@ class _Analogue(NamedTuple):
     size: Array  # typical size of each entry of the state, (n,)
 
 
-def _over_a_sample(analogue: _Analogue, period: Array) -> Array:
-    """Exact transition over a sample with held commands and forces, (n, n + 3 K + 3)."""
+class _Sampled(NamedTuple):
+    """Exact over a sample; commands on their way are part of the state, u_(k-2) first."""
+
+    held: Array  # by the state and u_(k-1), (n, n + 3 K)
+    newest: Array | None  # by u_k, if its delay can be below a sample, (n, 3 K)
+    force: Array  # by slider forces held over the sample, (n, 3)
+    present: Array  # command on the actuators, of state and u_(k-1), (3 K, n + 3 K)
+
+
+def _over_a_sample(structure: Structure, analogue: _Analogue, case: Case) -> _Sampled:
+    """Transition of plant and electronics from sample to sample."""
+    period, n_sensors = case.electronics.period, 3 * structure.n_patches
+    eye = jnp.eye(n_sensors, dtype=analogue.state.dtype)
+    if not structure.has_delay:
+        exact = _held_transition(analogue, period)
+        n = len(exact)
+        held, force = exact[:, : n + n_sensors], exact[:, n + n_sensors :]
+        return _Sampled(held, None, force, jnp.pad(eye, ((0, 0), (n, 0))))
+    change = command_change(true_delay(case.electronics))
+    first, second = (
+        _held_transition(analogue, share * period) for share in (change.share, 1 - change.share)
+    )
+    n = len(first)
+    whole = second[:, :n] @ first
+    force = whole[:, n + n_sensors :] + second[:, n + n_sensors :]
+    newest, last, *older = (
+        a * whole[:, n : n + n_sensors] + b * second[:, n : n + n_sensors]
+        for a, b in zip(change.before, change.after, strict=True)
+    )
+    # one queue: u_(k-1) enters as u_(k-2), each older one moves on
+    queue = jnp.eye((LONGEST - 1) * n_sensors, LONGEST * n_sensors, -n_sensors, eye.dtype)
+    queue = queue.at[:n_sensors, -n_sensors:].set(eye)
+    below = jnp.pad(queue, ((0, 0), (n, 0)))
+    above = jnp.concatenate([whole[:, :n], *older, last], axis=1)
+    present = jnp.concatenate([share * eye for share in (*change.before[2:], change.before[1])], 1)
+    ahead = ((0, len(queue)), (0, 0))
+    return _Sampled(
+        held=jnp.concatenate([above, below]),
+        newest=jnp.pad(newest, ahead),
+        force=jnp.pad(force, ahead),
+        present=jnp.pad(present, ((0, 0), (n, 0))),
+    )
+
+
+def _held_transition(analogue: _Analogue, period: Array) -> Array:
+    """Exact transition over a time with held commands and forces, (n, n + 3 K + 3)."""
     n, n_inputs = analogue.enters.shape
     held = jnp.zeros((n + n_inputs,) * 2, analogue.state.dtype)
     held = held.at[:n, :n].set(analogue.state).at[:n, n:].set(analogue.enters)

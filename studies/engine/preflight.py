@@ -130,6 +130,7 @@ def _without_run(structure: Structure) -> Structure:
         "has_poles",
         "has_amplifier",
         "has_sensor_highpass",
+        "has_delay",
     )
     fields = {name: getattr(structure, name) for name in kept}
     return Structure(n_steps=1, feedback="none", **fields)

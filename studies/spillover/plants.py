@@ -156,6 +156,7 @@ class LoopBuilder:
             has_wrench=nominal.has_wrench,
             has_sensor_highpass=nominal.has_sensor_highpass,
             has_amplifier=nominal.has_amplifier,
+            has_delay=nominal.has_delay,
         )
         law = law._replace(feedback=law.feedback.without_rivals())  # linear: nothing switches
         law = jax.tree.map(jnp.asarray, law)

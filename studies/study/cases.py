@@ -35,17 +35,21 @@ from studies.study.spec import OWN_FIELDS, Study
 
 Tree = TypeVar("Tree")  # a Case, or numbers
 TWO_PI = 2 * np.pi
-#: What the program needs only where one of these fields is not 0, of poles: given at all.
+#: What the program needs only where one of these fields is not 0, or not its value in `NEUTRAL`;
+#: of poles: given at all.
 SWITCHES = {
     "has_wrench": ("load.wrench", "load.pulse"),
     "has_payload_offset": ("load.offset",),
     "has_sensor_highpass": ("electronics.sensor_highpass_hz",),
     "has_amplifier": ("electronics.amplifier_hz",),
+    "has_delay": ("electronics.delay", "electronics.unmodelled_delay"),
     "has_noise": ("electronics.adc_noise", "drive.ripple"),
     "has_friction": ("drive.coulomb_friction",),
     "has_poles": ("control.damping", "control.pole_decay"),
     "has_position_gain": ("control.position_gain", "control.damping", "control.pole_decay"),
 }
+#: Values other than 0 at which a field of `SWITCHES` needs nothing.
+NEUTRAL = {"electronics.delay": 1.0}
 #: Duration of a move that only pads a path with fewer moves [s].
 NO_TIME = 1e-12
 
@@ -86,7 +90,7 @@ def build_structure(study: Study, columns: Columns | None = None) -> Structure:
 def _is_used(field: str, values: np.ndarray) -> bool:
     if field in SWITCHES["has_poles"]:  # added damping of 0 specifies poles, too; NaN is none
         return bool(np.any(values >= 0))
-    return bool(np.any(values != 0))
+    return bool(np.any(values != NEUTRAL.get(field, 0.0)))
 
 
 def with_used(structure: Structure, fields: Iterable[str]) -> Structure:
@@ -327,6 +331,8 @@ def _electronics(numbers: Numbers, structure: Structure, xp: Any) -> Electronics
         antialias=TWO_PI * number("electronics.antialias_hz"),
         sensor_highpass=TWO_PI * number("electronics.sensor_highpass_hz"),
         amplifier_lag=xp.where(bandwidth > 0, 1 / xp.where(bandwidth > 0, bandwidth, 1.0), 0.0),
+        delay=number("electronics.delay"),
+        unmodelled_delay=number("electronics.unmodelled_delay"),
         conditioner_gain=number("electronics.conditioner_gain"),
         conditioner_bias=number("electronics.conditioner_bias"),
         adc_range=number("electronics.adc_range"),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxmodel.beam import BASES
+from jaxmodel.delay import LONGEST
 from jaxmodel.laws import LAWS
 from jaxmodel.piezo import VACUUM_PERMITTIVITY
 from studies.errors import field_error, nearest, shown
@@ -266,6 +267,14 @@ def _check_sampling(study: Study) -> None:
             electronics.amplifier_hz,
             f"0 (no limit) or {SLOWEST_AMPLIFIER:g} and more",
             "Hz",
+        )
+    delay, more = electronics.delay, electronics.unmodelled_delay
+    if not 0 <= delay + more <= LONGEST:
+        raise field_error(
+            "electronics.unmodelled_delay",
+            more,
+            f"{-delay:g} to {LONGEST - delay:g} at electronics.delay = {delay:g}",
+            "samples",
         )
     for value in study.shaper.frequencies_hz:
         if value >= rate / 2:

@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jaxmodel.beam import BASES
+from jaxmodel.delay import LONGEST
 from jaxmodel.estimator import KINDS
 from jaxmodel.laws import LAWS
 from jaxmodel.motion import PROFILES
@@ -389,6 +390,22 @@ class ElectronicsSection(Section):
     )
     amplifier_hz: float = described(
         0.0, "Hz", "bandwidth (-3 dB) of the actuators' amplifiers; 0: no limit", ge=0, le=1e6
+    )
+    delay: float = described(
+        1.0,
+        "samples",
+        "from a sample to its command on the actuators; the controller's model has it",
+        ge=0,
+        le=LONGEST,
+        free=MACHINE,
+    )
+    unmodelled_delay: float = described(
+        0.0,
+        "samples",
+        "more of it, unknown to the controller; both together 0 to 4",
+        ge=-LONGEST,
+        le=LONGEST,
+        free=MACHINE,
     )
     estimator: Annotated[str, OneOf(lambda: KINDS)] = described(
         "modal_phase", "-", "velocity estimate"
