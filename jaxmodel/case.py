@@ -36,6 +36,7 @@ class Structure(NamedTuple):
     has_sensor_highpass: bool = False  # patches drained by their amplifiers' inputs
     has_amplifier: bool = False  # actuators behind amplifiers of finite bandwidth
     has_delay: bool = False  # commands arrive later or earlier than after one sample
+    has_notch: bool = False  # notch filters before the feedback
     has_noise: bool = False  # seeded ADC noise and force ripple
     has_friction: bool = False  # Coulomb friction on the sliders
     has_poles: bool = False  # gains follow from poles
@@ -71,6 +72,9 @@ class Control(NamedTuple):
     gain_factor: Array  # factor on the loop gain, whatever the law [1], ()
     is_per_mass: Array  # 1: gains in 1/s and 1/s2, 0: in N s/m and N/m, ()
     feedthrough_factor: Array  # share of the residual modes' feed-through compensated [1], ()
+    notch: Array  # frequency of the links' notch filters [rad/s]; 0: none, (3,)
+    notch_depth: Array  # their gain there [1], (3,)
+    notch_width: Array  # stop band over frequency [1], (3,)
     parameters: dict[str, Array]  # the law's own, by name, (3,) each
     system: StateSpace | None = None  # controller from a file
 

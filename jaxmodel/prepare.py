@@ -13,7 +13,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.control import active_modes, condition_number, left_inverse
 from jaxmodel.controller import Controller, Feedback, with_gains
-from jaxmodel.delay import command_change, true_delay
+from jaxmodel.delay import LONGEST, command_change, true_delay
 from jaxmodel.drive import Reference
 from jaxmodel.dynamics import inverse_dynamics
 from jaxmodel.electronics import Amplifier, design_amplifier, voltage_passage
@@ -25,6 +25,7 @@ from jaxmodel.laws.contract import NominalModel, check_feedback
 from jaxmodel.laws.poles import is_unplaceable
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import Delayed, LeftOut, Loop, Rest
+from jaxmodel.notch import design_notch
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import (
     actuator_constant,
@@ -298,6 +299,7 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
         adc_step=jnp.asarray(electronics.adc_range / electronics.adc_levels),
         adc_top=jnp.asarray(electronics.adc_levels - 1.0),
         adc_noise=jnp.asarray(electronics.adc_noise),
+        notch=design_notch(control, electronics.period) if structure.has_notch else None,
     )
     return ControllerDesign(
         controller=with_gains(controller, control.gain_factor),
@@ -379,6 +381,7 @@ def _static_status(
         ),
         (jnp.any(zeta >= 1), status.OVERDAMPED),
         (_has_unplaceable_poles(structure, case, design), status.UNPLACEABLE),
+        (_is_delay_off(structure, case), status.DELAY_OFF),
         (
             ~jnp.all((windows.stations > 0) & (windows.stations < 1)),
             status.STATION_OFF_LINK,
@@ -434,6 +437,11 @@ def _has_unplaceable_poles(structure: Structure, case: Case, design: ControllerD
     return is_unplaceable(structure, case, design.nominal)
 
 
+def _is_delay_off(structure: Structure, case: Case) -> Array:
+    delay = true_delay(case.electronics)
+    return ((delay < 0) | (delay > LONGEST)) & structure.is_delayed
+
+
 def _is_too_fast(structure: Structure, case: Case, bases: Bases) -> Array:
     """Whether a filter or the shaper is beyond half the sample rate."""
     half = jnp.pi / case.electronics.period
@@ -444,4 +452,5 @@ def _is_too_fast(structure: Structure, case: Case, bases: Bases) -> Array:
     has_lowpass = case.electronics.estimator == KINDS.index("modal_phase")
     is_fast |= (lowpass_corner(structure, case, bases) >= half) & has_lowpass
     is_fast |= case.electronics.sensor_highpass >= half
+    is_fast |= jnp.any(case.control.notch >= half)
     return is_fast | (case.electronics.antialias >= half)

@@ -22,6 +22,7 @@ from jaxmodel.estimator import Estimator
 from jaxmodel.kinematics import close_chain
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import Loop
+from jaxmodel.notch import Notch
 from jaxmodel.pairs import Pair, determinant, product
 from jaxmodel.parameters import Array
 from jaxmodel.plant import Plant
@@ -66,6 +67,7 @@ class LoopResponse(NamedTuple):
     highpass: Array | None  # of the patches [rad/s], None if there is none, ()
     lag: Array | None  # of the amplifiers [s], None if there are none, ()
     late: Lateness | None = None  # None: the delay is one sample
+    notch: Notch | None = None  # of the links with channels, (n, 1) each
 
 
 def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> LoopResponse:
@@ -155,6 +157,7 @@ def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
         highpass=electronics.sensor_highpass if structure.has_sensor_highpass else None,
         lag=electronics.amplifier_lag if structure.has_amplifier else None,
         late=_lateness(case) if structure.has_delay else None,
+        notch=jax.tree.map(lambda x: x[:, None], loop.controller.notch),
     )
 
 
@@ -245,6 +248,7 @@ _CHANNEL_FIELDS = (
     "estimator",
     "velocity_gain",
     "position_gain",
+    "notch",
 )
 
 
@@ -454,6 +458,9 @@ def _channel(response: LoopResponse, shift: Pair) -> Pair:
     force = above * section(b0, b1, zero) * below.inverse()
     if response.position_gain is not None:
         force = force + response.position_gain * estimator.direct
+    if response.notch is not None:
+        b0, b1, b2, a1, a2 = response.notch
+        force = force * (section(b0, b1, b2) * section(1 + 0 * a1, a1, a2).inverse())
     return -(force * shift)
 
 

@@ -43,6 +43,7 @@ SWITCHES = {
     "has_sensor_highpass": ("electronics.sensor_highpass_hz",),
     "has_amplifier": ("electronics.amplifier_hz",),
     "has_delay": ("electronics.delay", "electronics.unmodelled_delay"),
+    "has_notch": ("control.notch_hz",),
     "has_noise": ("electronics.adc_noise", "drive.ripple"),
     "has_friction": ("drive.coulomb_friction",),
     "has_poles": ("control.damping", "control.pole_decay"),
@@ -286,6 +287,9 @@ def _control(numbers: Numbers, structure: Structure, xp: Any) -> Control:
         gain_factor=number("control.gain_factor"),
         is_per_mass=number("control.gain_unit").astype(float),
         feedthrough_factor=number("control.feedthrough_factor"),
+        notch=TWO_PI * number("control.notch_hz"),
+        notch_depth=number("control.notch_depth"),
+        notch_width=number("control.notch_width"),
         parameters={x.name: number(f"{OWN_FIELDS}.{law.name}.{x.name}") for x in law.parameters},
         system=numbers.get("state_space"),
     )

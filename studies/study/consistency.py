@@ -276,6 +276,11 @@ def _check_sampling(study: Study) -> None:
             f"{-delay:g} to {LONGEST - delay:g} at electronics.delay = {delay:g}",
             "samples",
         )
+    notches = study.control.notch_hz
+    if max(notches) >= rate / 2:
+        raise field_error(
+            "control.notch_hz", notches, f"below half the sample rate, {rate / 2:g}", "Hz"
+        )
     for value in study.shaper.frequencies_hz:
         if value >= rate / 2:
             raise field_error(

@@ -39,6 +39,9 @@ Deflection = Annotated[float, Field(ge=-0.1, le=0.1)]
 Force = Annotated[float, Field(ge=-1e4, le=1e4)]
 Wrench = tuple[Force, Force, Force]
 Gain = Annotated[float, Field(ge=-1e9, le=1e9)]
+NotchHertz = Annotated[float, Field(ge=0, le=1e5)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Width = Annotated[float, Field(ge=1e-3, le=10)]
 Hertz = Annotated[float, Field(ge=0.1, le=1e5)]
 Zeta = Annotated[float, Field(ge=0, lt=1)]
 Time = Annotated[float, Field(ge=1e-4, le=100)]
@@ -348,6 +351,15 @@ class ControlSection(Section):
     )
     feedthrough_factor: float = described(
         0.0, "1", "subtracted share of the residual modes' feed-through", ge=0, le=1, free=DESIGN
+    )
+    notch_hz: tuple[NotchHertz, NotchHertz, NotchHertz] = described(
+        (0.0, 0.0, 0.0), "Hz", "notch filter of each link between sensors and feedback; 0: none"
+    )
+    notch_depth: tuple[Share, Share, Share] = described(
+        (0.1, 0.1, 0.1), "1", "its gain at that frequency", free=DESIGN
+    )
+    notch_width: tuple[Width, Width, Width] = described(
+        (0.2, 0.2, 0.2), "1", "width of its stop band over that frequency", free=DESIGN
     )
 
     @property

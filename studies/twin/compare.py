@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.beam import BASES
+from studies.engine.controller import check_codable
 from studies.engine.preflight import check_run
 from studies.engine.runs import Run, run_study, uncontrolled_twin
 from studies.errors import StudyError, field_error
@@ -92,6 +93,7 @@ def check_supported(study: Study) -> None:
         raise field_error("run.model", run.model, "'coupled' for studies twin", "-")
     if run.smooth:
         raise field_error("run.smooth", run.smooth, "false for studies twin", "-")
+    check_codable(study)
     if build_structure(study).has_delay:
         delay = study.electronics.delay + study.electronics.unmodelled_delay
         raise field_error("electronics.delay", delay, "1 for studies twin", "samples")
