@@ -298,7 +298,7 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
         adc_bias=jnp.asarray(electronics.conditioner_bias),
         adc_step=jnp.asarray(electronics.adc_range / electronics.adc_levels),
         adc_top=jnp.asarray(electronics.adc_levels - 1.0),
-        adc_noise=jnp.asarray(electronics.adc_noise),
+        adc_noise=_converter_noise(case),
         notch=design_notch(control, electronics.period) if structure.has_notch else None,
     )
     return ControllerDesign(
@@ -308,6 +308,15 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
         sensor_condition=condition_number(seen, mask),
         actuator_condition=condition_number(driven, mask),
     )
+
+
+def _converter_noise(case: Case) -> Array:
+    """Noise at the ADC's input, of strain gauges with that of their amplifiers [V], ()."""
+    electronics, patches = case.electronics, case.machine.patches
+    own = electronics.conditioner_gain * patches.gauge_noise
+    is_more = (patches.is_gauge > 0) & (own > 0)
+    both = jnp.sqrt(jnp.where(is_more, electronics.adc_noise**2 + own**2, 1.0))
+    return jnp.where(is_more, both, electronics.adc_noise)
 
 
 def _believed_damping(case: Case, omega: Array) -> Array:

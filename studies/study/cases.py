@@ -44,7 +44,7 @@ SWITCHES = {
     "has_amplifier": ("electronics.amplifier_hz",),
     "has_delay": ("electronics.delay", "electronics.unmodelled_delay"),
     "has_notch": ("control.notch_hz",),
-    "has_noise": ("electronics.adc_noise", "drive.ripple"),
+    "has_noise": ("electronics.adc_noise", "drive.ripple", "patches.gauge_noise"),
     "has_friction": ("drive.coulomb_friction",),
     "has_poles": ("control.damping", "control.pole_decay"),
     "has_position_gain": ("control.position_gain", "control.damping", "control.pole_decay"),
@@ -209,10 +209,20 @@ def _machine(numbers: Numbers, structure: Structure, xp: Any) -> Machine:
         beam=Beam(*(number(f"link.{name}") for name in Beam._fields)),
         patches=Patches(
             center=number("patches.centers"),
-            **{name: number(f"patches.{name}") for name in Patches._fields if name != "center"},
+            **{name: number(f"patches.{name}") for name in Patches._fields[1:9]},
+            is_gauge=1.0 * number("patches.sensor"),
+            gauge_factor=number("patches.gauge_factor"),
+            bridge=_bridge(numbers),
+            gauge_noise=number("patches.gauge_noise"),
         ),
         damping=_damping(numbers, xp),
     )
+
+
+def _bridge(numbers: Numbers) -> Any:
+    """Amplified voltage of a bridge per relative change of an arm's resistance [V]."""
+    excitation, gain = numbers["patches.gauge_excitation"], numbers["patches.gauge_gain"]
+    return excitation * gain * numbers["patches.gauge_arms"] / 4
 
 
 def _joint_angle(numbers: Numbers, xp: Any) -> Any:
@@ -333,7 +343,10 @@ def _electronics(numbers: Numbers, structure: Structure, xp: Any) -> Electronics
     return Electronics(
         period=1 / number("electronics.sample_rate_hz"),
         antialias=TWO_PI * number("electronics.antialias_hz"),
-        sensor_highpass=TWO_PI * number("electronics.sensor_highpass_hz"),
+        # nothing drains a strain gauge
+        sensor_highpass=TWO_PI
+        * number("electronics.sensor_highpass_hz")
+        * (1.0 - number("patches.sensor")),
         amplifier_lag=xp.where(bandwidth > 0, 1 / xp.where(bandwidth > 0, bandwidth, 1.0), 0.0),
         delay=number("electronics.delay"),
         unmodelled_delay=number("electronics.unmodelled_delay"),

@@ -200,6 +200,11 @@ def _check_patches(study: Study) -> None:
                 f"centres at least {pitch:g} apart, so that no patches overlap{of_link}",
                 "m",
             )
+    drain = study.electronics.sensor_highpass_hz
+    if patches.sensor == "strain_gauge" and drain > 0:
+        raise field_error(
+            "electronics.sensor_highpass_hz", drain, "0 where patches.sensor = 'strain_gauge'", "Hz"
+        )
     widths = each_link(patches.width)
     for i in np.flatnonzero(widths > each_link(link.width) * (1 + 1e-9))[:1]:
         raise field_error(

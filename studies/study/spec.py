@@ -200,7 +200,7 @@ class LinkSection(Section):
 
 
 class PatchesSection(Section):
-    """Piezo pairs: sensor and actuator on opposite faces share a centre; one number, or three."""
+    """Pairs of sensor and piezo actuator, which share a centre on opposite faces of a link."""
 
     centers: tuple[float, ...] | tuple[tuple[float, ...], ...] = described(
         (0.05, 0.10, 0.15),
@@ -232,6 +232,16 @@ class PatchesSection(Section):
     density: EachLink[Annotated[float, Field(ge=0, le=3e4)]] = described(
         7800.0, "kg/m3", "density of the ceramic", free=MACHINE
     )
+    sensor: Literal["piezo", "strain_gauge"] = described(
+        "piezo", "-", "sensors: piezo patches, or strain gauges of sensor_length on the bare face"
+    )
+    gauge_factor: float = described(
+        2.1, "1", "relative change of resistance over strain", gt=0, le=500, free=MACHINE
+    )
+    gauge_excitation: float = described(5.0, "V", "of the gauges' bridges", gt=0, le=100)
+    gauge_arms: int = described(2, "1", "active arms of a bridge's four", ge=1, le=4)
+    gauge_gain: float = described(1000.0, "1", "of the bridges' amplifiers", gt=0, le=1e6)
+    gauge_noise: float = described(0.0, "V", "rms behind these amplifiers", ge=0, le=10)
 
 
 class MotionSection(Section):
