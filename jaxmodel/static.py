@@ -49,7 +49,13 @@ def link_pieces(beam: Beam, patches: Patches) -> Pieces:
         return ((left < middle) & (middle < right)).astype(cuts.dtype)
 
     seen = covers(sensor)
-    return Pieces(cuts[:-1], cuts[1:], seen, covers(actuator), seen * (1.0 - patches.is_gauge))
+    return Pieces(
+        left=cuts[:-1],
+        right=cuts[1:],
+        has_sensor=seen,
+        has_actuator=covers(actuator),
+        has_ceramic=seen * (1.0 - patches.is_gauge),
+    )
 
 
 def section_stiffness(beam: Beam, patches: Patches, pieces: Pieces, has_patches: bool) -> Array:
