@@ -313,7 +313,7 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
     bends = _bends(pieces, length)
     line_mass = beam.density * beam.width * beam.thickness
     patch_mass = patches.density * patches.width * patches.thickness
-    covers = jnp.sum(pieces.has_sensor + pieces.has_actuator, axis=0)
+    covers = jnp.sum(pieces.has_ceramic + pieces.has_actuator, axis=0)
 
     def shapes(xi: Array) -> _Shapes:
         smooth, bent = _smooth_shapes(xi, n_sines)[0], _bent_shapes(xi, bends)

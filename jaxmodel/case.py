@@ -35,6 +35,8 @@ class Structure(NamedTuple):
     drive: str = "pd"  # name in `jaxmodel.drives.DRIVES`
     has_sensor_highpass: bool = False  # patches drained by their amplifiers' inputs
     has_amplifier: bool = False  # actuators behind amplifiers of finite bandwidth
+    has_delay: bool = False  # commands arrive later or earlier than after one sample
+    has_notch: bool = False  # notch filters before the feedback
     has_noise: bool = False  # seeded ADC noise and force ripple
     has_friction: bool = False  # Coulomb friction on the sliders
     has_poles: bool = False  # gains follow from poles
@@ -42,6 +44,16 @@ class Structure(NamedTuple):
     metrics: tuple[str, ...] = ()  # to accumulate; (): all of them
     is_linear: bool = False  # mechanics to first order about rest at the last way-point
     is_smooth: bool = False  # for gradients: noise instead of rounding, limits with round corners
+
+    @property
+    def is_delayed(self) -> bool:
+        """Whether commands change within samples."""
+        return self.has_delay and self.feedback == "sampled"
+
+    @property
+    def plant_steps(self) -> int:
+        """Plant steps in a sample: `substeps`, before and after a command changes."""
+        return self.substeps * (2 if self.is_delayed else 1)
 
 
 class Control(NamedTuple):
@@ -60,6 +72,9 @@ class Control(NamedTuple):
     gain_factor: Array  # factor on the loop gain, whatever the law [1], ()
     is_per_mass: Array  # 1: gains in 1/s and 1/s2, 0: in N s/m and N/m, ()
     feedthrough_factor: Array  # share of the residual modes' feed-through compensated [1], ()
+    notch: Array  # frequency of the links' notch filters [rad/s]; 0: none, (3,)
+    notch_depth: Array  # their gain there [1], (3,)
+    notch_width: Array  # stop band over frequency [1], (3,)
     parameters: dict[str, Array]  # the law's own, by name, (3,) each
     system: StateSpace | None = None  # controller from a file
 
@@ -71,6 +86,8 @@ class Electronics(NamedTuple):
     antialias: Array  # corner of the Butterworth filter [rad/s], ()
     sensor_highpass: Array  # corner 1/(R C) of a patch into its amplifier [rad/s], ()
     amplifier_lag: Array  # time constant of the actuators' amplifiers [s], ()
+    delay: Array  # from a sample to its command on the actuators [samples], ()
+    unmodelled_delay: Array  # more of it, which the controller does not know [samples], ()
     conditioner_gain: Array  # ADC volt per sensor volt [1], ()
     conditioner_bias: Array  # [V], ()
     adc_range: Array  # full scale, from 0 [V], ()

@@ -1,4 +1,4 @@
-"""The sampled controller: ADC, feedback, saturation, delay.
+"""The sampled controller: ADC, notch filters, feedback, saturation, delay.
 
 Feedback is modal filter, estimator, gains and synthesizer, channel by channel, or a linear system
 of any order. `controller_step` is what a DSP does once per sample. Shapes: links first, then
@@ -12,6 +12,7 @@ from typing import NamedTuple
 from jaxmodel.channels import Channels
 from jaxmodel.estimator import FilterState
 from jaxmodel.lazy import jnp
+from jaxmodel.notch import Notch, NotchState, advance_notch
 from jaxmodel.parameters import Array
 from jaxmodel.state_space import StateSpace
 
@@ -30,6 +31,7 @@ class Controller(NamedTuple):
     adc_step: Array  # one code [V], ()
     adc_top: Array  # highest code [1], ()
     adc_noise: Array  # rms at the ADC input [V], ()
+    notch: Notch | None = None  # before the feedback; None: there is none
 
 
 class ControllerState(NamedTuple):
@@ -37,6 +39,7 @@ class ControllerState(NamedTuple):
 
     feedback: FilterState | Array  # of channels, or of a linear system, (G, N, b)
     voltage: Array  # command applied during this sample, computed in the last one [V], (3, K)
+    notch: NotchState | None = None
 
 
 class ControllerInfo(NamedTuple):
@@ -50,7 +53,8 @@ class ControllerInfo(NamedTuple):
 def rest_controller(controller: Controller) -> ControllerState:
     """All zeros."""
     voltage = jnp.zeros_like(jnp.asarray(controller.feedthrough)[..., 0])
-    return ControllerState(controller.feedback.at_rest(), voltage)
+    notch = None if controller.notch is None else (jnp.zeros_like(voltage),) * 2
+    return ControllerState(controller.feedback.at_rest(), voltage, notch)
 
 
 def with_gains(controller: Controller, factor: Array) -> Controller:
@@ -160,7 +164,10 @@ def controller_step(
     """
     measured, is_clipped = convert(controller, voltage, noise, is_smooth)
     own = jnp.sum(controller.feedthrough * state.voltage[:, None], axis=2)
-    after, demand = controller.feedback.step(state.feedback, measured - own)
+    seen, notch = measured - own, state.notch
+    if controller.notch is not None and notch is not None:
+        notch, seen = advance_notch(controller.notch, notch, seen)
+    after, demand = controller.feedback.step(state.feedback, seen)
     command = soft_limit(demand, controller.voltage_limit, is_smooth)
     after = controller.feedback.limited(after, command - demand)
-    return ControllerState(after, command), ControllerInfo(measured, command, is_clipped)
+    return ControllerState(after, command, notch), ControllerInfo(measured, command, is_clipped)

@@ -30,13 +30,15 @@ class Amplifier(NamedTuple):
 def measurement_chain(omega: Array, electronics: Electronics) -> Array:
     """Response from command to sampled signal at omega [rad/s], without the links.
 
-    R = A H B exp(-j omega T (1/2 + 1)) sinc(omega T/2): amplifier 1/(1 + j omega lag), high-pass
-    j omega/(j omega + omega_h), Butterworth anti-alias filter, delay of one sample, hold.
+    R = A H B exp(-j omega T (1/2 + d)) sinc(omega T/2): amplifier 1/(1 + j omega lag), high-pass
+    j omega/(j omega + omega_h), Butterworth anti-alias filter, delay of d samples as the controller
+    knows it, hold.
     """
     period = electronics.period
     s = 1j * omega / electronics.antialias
     hold = jnp.sin(omega * period / 2) / (omega * period / 2)
-    late = hold * jnp.exp(-1.5j * omega * period) / (s * s + jnp.sqrt(2.0) * s + 1)
+    lag = -1j * (0.5 + electronics.delay)
+    late = hold * jnp.exp(lag * omega * period) / (s * s + jnp.sqrt(2.0) * s + 1)
     seen = 1j * omega / (1j * omega + electronics.sensor_highpass)
     return late * seen / (1 + 1j * omega * electronics.amplifier_lag)
 
@@ -56,7 +58,7 @@ def design_amplifier(step: Array, lag: Array) -> Amplifier:
         Amplifier.
     """
     is_slow = lag > 0
-    rate = step / jnp.where(is_slow, lag, step)
+    rate = step / jnp.where(is_slow, lag, jnp.where(step > 0, step, 1.0))
     # int_0^1 exp(-rate (1 - s)) s^(k-1)/(k-1)! ds, the moments about the end of the step
     phi = _phi(rate)
     a, b, c = phi[0], phi[1], 2 * phi[2]
@@ -94,7 +96,8 @@ def voltage_passage(
     zero, one = jnp.zeros(()), jnp.ones(())
     drain = zero if highpass is None else zero + highpass
     is_slow = zero if lag is None else jnp.where(lag > 0, 1.0, 0.0)
-    decay = zero if lag is None else 1 / jnp.maximum(jnp.where(lag > 0, lag, step), step / FASTEST)
+    some = jnp.where(step > 0, step, 1.0)  # before a command that changes at once there is no time
+    decay = zero if lag is None else 1 / jnp.maximum(jnp.where(lag > 0, lag, some), some / FASTEST)
     corner = zero + antialias
     rows = (
         (zero, corner, zero, zero, zero),

@@ -57,7 +57,20 @@ class Loop(NamedTuple):
     axial_compliance: Array  # L/(E A) of the links [m/N], (3,)
     left_out: LeftOut | None  # static response of the modes left out; None: truncated model
     settling_band: Array  # [m], ()
+    delayed: Delayed | None = None  # None: commands are held from sample to sample, one later
     rest: Rest | None = None  # about which the linear model is taken; None: the full model
+
+
+class Delayed(NamedTuple):
+    """Commands that change within samples; the loop's own plant steps are those after it."""
+
+    before: Array  # 1 for the command u_(k-j) until the change, else 0, (J,)
+    after: Array  # the same from the change on, (J,)
+    # plant steps until the change
+    exponential: Exponential
+    plant_step: Array  # [s], ()
+    amplifier: Amplifier | None
+    passage: Array | None
 
 
 class LeftOut(NamedTuple):
@@ -94,6 +107,7 @@ class PlantState(NamedTuple):
     direct_z: Array | None = None  # anti-alias filtered [V], (3, K)
     direct_z_rate: Array | None = None  # [V/s], (3, K)
     direct_s: Array | None = None  # drained by the amplifiers' inputs [V], (3, K)
+    commands: Array | None = None  # on their way, u_(k-2), u_(k-3), .. [V], (J - 2, 3, K)
 
 
 class State(NamedTuple):
@@ -290,6 +304,7 @@ def plant_step(
         z_rate=mode(3),
         s=mode(4),
         voltage=last_voltage,
+        commands=state.commands,
         **_passed(loop, state, voltage),
     )
     return after, first
@@ -332,7 +347,8 @@ def _amplified(
 def step(structure: Structure, loop: Loop, state: State, inputs: Inputs) -> tuple[State, Record]:
     """One sample of the closed loop.
 
-    The controller samples first; its command reaches the actuators one sample later.
+    The controller samples first; its command reaches the actuators one sample later, or after the
+    delay of `Loop.delayed`.
 
     Args:
         structure: static choices.
@@ -384,7 +400,7 @@ def advance(
         loop: constants of the case.
         state: at the sampling instant.
         inputs: of this sample.
-        voltage: command of this sample [V], (3, K).
+        voltage: last command of the controller [V], (3, K).
         after: the controller's next state.
         clipped: 1 if an ADC channel clips, else 0, ().
 
@@ -393,7 +409,12 @@ def advance(
     """
     plant = state.plant
     held = None if state.drive is None else state.drive.force
-    next_plant, rates = _advance_plant(structure, loop, plant, inputs, voltage, held)
+    if loop.delayed is None:
+        next_plant, rates = _advance_plant(structure, loop, plant, inputs, voltage, held)
+    else:
+        voltage, next_plant, rates = _advance_delayed(
+            structure, loop, loop.delayed, plant, inputs, (after.voltage, voltage), held
+        )
     reference, chain = _reference(inputs, 0, held), rates.chain
     motors = motor_force(structure, loop.drive, reference, chain.rho, chain.rho_rate)
     present = voltage if plant.voltage is None else plant.voltage
@@ -521,6 +542,48 @@ def _advance_plant(
     return last, jax.tree.map(lambda x: x[0], rates)
 
 
+def _advance_delayed(
+    structure: Structure,
+    loop: Loop,
+    delayed: Delayed,
+    plant: PlantState,
+    inputs: Inputs,
+    newest: tuple[Array, Array],
+    held: Array | None,
+) -> tuple[Array, PlantState, Rates]:
+    """A sample in which the command changes.
+
+    Returns:
+        (command on the actuators at its start [V], (3, K); plant at its end, rates at its start).
+    """
+    assert plant.commands is not None
+    older = [plant.commands[j] for j in range(plant.commands.shape[0])]
+    first, second = (
+        sum(share[j] * u for j, u in enumerate((*newest, *older)))
+        for share in (delayed.before, delayed.after)
+    )
+    left_out = loop.left_out
+    start = loop._replace(
+        exponential=delayed.exponential,
+        plant_step=delayed.plant_step,
+        amplifier=delayed.amplifier,
+        left_out=None if left_out is None else left_out._replace(passage=delayed.passage),
+    )
+    cut = 2 * structure.substeps
+    until, then = (
+        inputs._replace(
+            rho=inputs.rho[part],
+            rho_rate=inputs.rho_rate[part],
+            feedforward=None if inputs.feedforward is None else inputs.feedforward[part],
+        )
+        for part in (slice(0, cut + 1), slice(cut, None))
+    )
+    changed, rates = _advance_plant(structure, start, plant, until, first, held)
+    last, _ = _advance_plant(structure, loop, changed, then, second, held)
+    present = jnp.where(delayed.plant_step > 0, first, second)
+    return present, last._replace(commands=jnp.stack([newest[1], *older[:-1]])), rates
+
+
 def _sample(
     loop: Loop,
     plant: PlantState,
@@ -620,6 +683,7 @@ def initial_state(
             direct_z=jnp.zeros_like(controller.voltage) if is_direct else None,
             direct_z_rate=jnp.zeros_like(controller.voltage) if is_direct else None,
             direct_s=jnp.zeros_like(controller.voltage) if is_direct and is_drained else None,
+            commands=None if loop.delayed is None else _on_their_way(loop.delayed, controller),
         ),
         controller=controller,
         totals=totals,
@@ -627,3 +691,8 @@ def initial_state(
         bad_time=jnp.zeros_like(code),
         drive=resting_drive(DRIVES[structure.drive], still),
     )
+
+
+def _on_their_way(delayed: Delayed, controller: ControllerState) -> Array:
+    """Commands before the start, all zero [V], (J - 2, 3, K)."""
+    return jnp.stack([jnp.zeros_like(controller.voltage)] * (delayed.before.shape[0] - 2))

@@ -135,7 +135,14 @@ def sample_path(path: Path, time: Array) -> PathSample:
     return PathSample(*jnp.vectorize(at, signature="()->(d),(d),(d)")(time))
 
 
-def shape_path(path: Path, taps: Taps, n_times: int, per_sample: int, step: Array) -> PathSample:
+def shape_path(
+    path: Path,
+    taps: Taps,
+    n_times: int,
+    per_sample: int,
+    step: Array,
+    within: Array | None = None,
+) -> PathSample:
     """Return the path convolved with a sampled input shaper, on the grid t_j = j h.
 
     X_ref(t) = sum_i W_i X(t - n_i T) with T = per_sample h. The path is evaluated once on the grid
@@ -147,11 +154,17 @@ def shape_path(path: Path, taps: Taps, n_times: int, per_sample: int, step: Arra
         n_times: number of grid points, positive, static [1].
         per_sample: grid steps in one sample period, static [1].
         step: h, grid step [s], shape ().
+        within: when the points of a sample are, from its start [s], shape (per_sample,); None: a
+            grid step apart.
 
     Returns:
         PathSample with arrays of shape (n_times, 3).
     """
-    sampled = sample_path(path, step * jnp.arange(n_times))
+    time = step * jnp.arange(n_times)
+    if within is not None:
+        sample, point = np.divmod(np.arange(n_times), per_sample)
+        time = step * per_sample * sample + within[point]
+    sampled = sample_path(path, time)
     # The path is at rest at t = 0, so its first row also holds before that.
     padded = jax.tree.map(lambda x: jnp.pad(x, ((n_times, 0), (0, 0)), mode="edge"), sampled)
     shifts = jnp.clip(taps.sample * per_sample, 0, n_times)

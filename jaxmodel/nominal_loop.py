@@ -15,6 +15,7 @@ from jaxmodel.laws.contract import NominalModel
 from jaxmodel.laws.link_model import LinkModel, link_model
 from jaxmodel.laws.poles import is_placed, nominal_modes, specified_poles
 from jaxmodel.lazy import jax, jnp
+from jaxmodel.notch import Notch, advance_notch, design_notch
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import design_controller
 from jaxmodel.state_space import StateSpace
@@ -46,20 +47,29 @@ def _of_modes(structure: Structure, case: Case, law: Channels, nominal: NominalM
     model = nominal_modes(structure, case, nominal)
     position = 0 * law.velocity_gain if law.position_gain is None else law.position_gain
     n = model.state.shape[-1]
+    notch = design_notch(case.control, case.electronics.period) if structure.has_notch else None
 
-    def one(model: LinkModel, estimator: Array, velocity: Array, position: Array) -> Array:
+    def one(
+        model: LinkModel, estimator: Array, velocity: Array, position: Array, notch: Notch | None
+    ) -> Array:
         def advance(x: Array) -> Array:
             plant, first, second = x[:n], x[n], (x[n + 1], x[n + 2])
-            seen = model.sensor[0] @ plant
+            seen, memory = model.sensor[0] @ plant, x[n + 3 :]
+            if notch is not None:
+                column = Notch(*(x[None] for x in notch))
+                memory, seen = advance_notch(column, (memory[:1, None], memory[1:, None]), seen)
+                memory, seen = jnp.ravel(jnp.stack(memory)), seen[0, 0]
             after, line = advance_filters(estimator, FilterState(first, second), seen)
             value = weighted(estimator.position, line) + estimator.direct * seen
             force = -velocity * weighted(estimator.velocity, line) - position * value
             moved = model.state @ plant + model.enter[:, 0] * force
-            return jnp.concatenate([moved, jnp.stack([after.first, *after.second])])
+            return jnp.concatenate([moved, jnp.stack([after.first, *after.second]), memory])
 
-        return jax.jacfwd(advance)(jnp.zeros((n + 3,), velocity.dtype))
+        size = n + 3 + (0 if notch is None else 2)
+        return jax.jacfwd(advance)(jnp.zeros((size,), velocity.dtype))
 
-    return jax.vmap(jax.vmap(one))(model, law.estimator, law.velocity_gain, position)
+    by_mode = jax.vmap(one, (0, 0, 0, 0, None))
+    return jax.vmap(by_mode)(model, law.estimator, law.velocity_gain, position, notch)
 
 
 def _of_links(

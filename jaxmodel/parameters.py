@@ -57,9 +57,10 @@ class Beam(NamedTuple):
 
 
 class Patches(NamedTuple):
-    """Piezo pairs: sensor and actuator of pair k share a centre, on opposite faces of the link.
+    """Pairs of sensor and actuator, which share a centre on opposite faces of the link.
 
-    () or (3,) each, except the centres.
+    Actuators are piezo patches; sensors, too, or strain gauges on the bare face. () or (3,) each,
+    except the centres.
     """
 
     center: Array  # [m], (3, n_patches)
@@ -71,6 +72,10 @@ class Patches(NamedTuple):
     d31: Array  # [C/N]
     relative_permittivity: Array  # eps33T/eps0 [1]
     density: Array  # [kg/m3]
+    is_gauge: Array = 0.0  # 1: sensors are strain gauges, 0: piezo patches
+    gauge_factor: Array = 2.1  # relative change of resistance over strain [1]
+    bridge: Array = 2500.0  # amplified bridge voltage per relative change of resistance [V]
+    gauge_noise: Array = 0.0  # of the bridge's amplifier, rms [V]
 
 
 class Damping(NamedTuple):

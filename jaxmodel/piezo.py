@@ -1,4 +1,4 @@
-"""Piezo patches by laminate theory: sections, actuator and sensor constants, slope differences."""
+"""Piezo patches by laminate theory, and strain gauges: sections, constants, slope differences."""
 
 from __future__ import annotations
 
@@ -72,14 +72,27 @@ def sensor_capacitance(patches: Patches) -> Array:
 
 
 def sensor_constant(beam: Beam, patches: Patches) -> Array:
-    """lambda_s [V/rad] of (15): open-circuit voltage per slope difference over the sensor.
+    """lambda_s [V/rad] of (15): voltage per slope difference over the sensor.
 
-    lambda_s = b_p E_p |d31| z_s/C with z_s = (t_b + t_p)/2, since the actuator covers the other
-    face, and the clamped capacitance C.
+    Of a piezo patch, open-circuit, lambda_s = b_p E_p |d31| z_s/C with z_s = (t_b + t_p)/2, since
+    the actuator covers the other face, and the clamped capacitance C; of a strain gauge, see
+    `gauge_constant`.
     """
     arm = (beam.thickness + patches.thickness) / 2
     charge = patches.width * patches.youngs_modulus * jnp.abs(patches.d31) * arm
-    return charge / sensor_capacitance(patches)
+    piezo = charge / sensor_capacitance(patches)
+    return jnp.where(jnp.asarray(patches.is_gauge) > 0, gauge_constant(beam, patches), piezo)
+
+
+def gauge_constant(beam: Beam, patches: Patches) -> Array:
+    """lambda_s [V/rad] of a strain gauge: amplified bridge voltage per slope difference over it.
+
+    Its mean strain is (t_b/2 + z_n)/l_g times the difference of slope over its length l_g; z_n is
+    the shift of the neutral axis towards the actuator on the other face. With gauge factor k,
+    excitation U, n active arms of four and gain g, V = U g (n/4) k strain (Hoffmann 1989).
+    """
+    arm = beam.thickness / 2 + one_sided_section(beam, patches).neutral_axis
+    return patches.bridge * patches.gauge_factor * arm / patches.sensor_length
 
 
 def patch_ends(center: Array, length: Array) -> tuple[Array, Array]:

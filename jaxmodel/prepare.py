@@ -13,19 +13,21 @@ from jaxmodel.case import Case, Drive, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.control import active_modes, condition_number, left_inverse
 from jaxmodel.controller import Controller, Feedback, with_gains
+from jaxmodel.delay import LONGEST, command_change, true_delay
 from jaxmodel.drive import Reference
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import drive_gains
 from jaxmodel.dynamics import inverse_dynamics
-from jaxmodel.electronics import design_amplifier, voltage_passage
+from jaxmodel.electronics import Amplifier, design_amplifier, voltage_passage
 from jaxmodel.estimator import KINDS
-from jaxmodel.integrator import exponential_step
+from jaxmodel.integrator import Exponential, exponential_step
 from jaxmodel.kinematics import close_chain
 from jaxmodel.laws import LAWS, is_modal, n_channels
 from jaxmodel.laws.contract import NominalModel, check_feedback
 from jaxmodel.laws.poles import is_unplaceable
 from jaxmodel.lazy import jax, jnp
-from jaxmodel.loop import LeftOut, Loop, Rest
+from jaxmodel.loop import Delayed, LeftOut, Loop, Rest
+from jaxmodel.notch import design_notch
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import (
     actuator_constant,
@@ -89,23 +91,17 @@ def prepare(structure: Structure, case: Case) -> Prepared:
     omega = jnp.sqrt(basis.stiffness / basis.mass)
     zeta = plant.damping / (2 * basis.mass * omega)
     step = electronics.period / structure.substeps
+    change = command_change(true_delay(electronics)) if structure.is_delayed else None
+    after = step if change is None else (1 - change.share) * step
     lambda_s, lambda_a = _constants(case)
     sensor = lambda_s[:, None, None] * jnp.swapaxes(basis.sensor_slope, 1, 2)
     angle = 2 * jnp.pi * electronics.period * spectrum_frequencies(structure, bases)
     loop = Loop(
         plant=plant,
         omega=omega,
-        exponential=exponential_step(
-            omega,
-            zeta,
-            step,
-            electronics.antialias,
-            electronics.sensor_highpass if structure.has_sensor_highpass else None,
-        ),
-        plant_step=step,
-        amplifier=(
-            design_amplifier(step, electronics.amplifier_lag) if structure.has_amplifier else None
-        ),
+        exponential=_exponential(structure, case, omega, zeta, after),
+        plant_step=after,
+        amplifier=_amplifier(structure, case, after),
         sensor=sensor,
         actuator=lambda_a[:, None, None] * basis.actuator_slope / basis.mass[:, :, None],
         deflection_at=basis.deflection_at,
@@ -117,9 +113,20 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         drive=_each_slider(case.drive),
         axial_compliance=axial_compliance(machine.beam),
         settling_band=jnp.asarray(case.windows.settling_band),
-        left_out=_left_out(structure, case, basis, step),
+        left_out=_left_out(structure, case, basis, after),
         rest=_rest(structure, case, plant) if structure.is_linear else None,
     )
+    if change is not None:
+        until = change.share * step
+        delayed = Delayed(
+            before=change.before,
+            after=change.after,
+            exponential=_exponential(structure, case, omega, zeta, until),
+            plant_step=until,
+            amplifier=_amplifier(structure, case, until),
+            passage=_passage(structure, case, until) if structure.has_static_correction else None,
+        )
+        loop = loop._replace(delayed=delayed)
     return Prepared(
         loop=loop,
         bases=bases,
@@ -131,22 +138,46 @@ def prepare(structure: Structure, case: Case) -> Prepared:
     )
 
 
+def _exponential(
+    structure: Structure, case: Case, omega: Array, zeta: Array, step: Array
+) -> Exponential:
+    electronics = case.electronics
+    return exponential_step(
+        omega,
+        zeta,
+        step,
+        electronics.antialias,
+        electronics.sensor_highpass if structure.has_sensor_highpass else None,
+    )
+
+
+def _amplifier(structure: Structure, case: Case, step: Array) -> Amplifier | None:
+    if not structure.has_amplifier:
+        return None
+    return design_amplifier(step, case.electronics.amplifier_lag)
+
+
+def _passage(structure: Structure, case: Case, step: Array) -> Array | None:
+    """See `LeftOut`."""
+    if structure.feedback != "sampled":
+        return None
+    electronics = case.electronics
+    return voltage_passage(
+        step,
+        electronics.antialias,
+        electronics.sensor_highpass if structure.has_sensor_highpass else None,
+        electronics.amplifier_lag if structure.has_amplifier else None,
+    )
+
+
 def _left_out(structure: Structure, case: Case, basis: ModalBasis, step: Array) -> LeftOut | None:
     """Static response of the modes that the plant leaves out."""
     if not structure.has_static_correction:
         return None
-    electronics, passage = case.electronics, None
-    if structure.feedback == "sampled":
-        passage = voltage_passage(
-            step,
-            electronics.antialias,
-            electronics.sensor_highpass if structure.has_sensor_highpass else None,
-            electronics.amplifier_lag if structure.has_amplifier else None,
-        )
     return LeftOut(
         sensor=_left_out_voltage(case, basis),
         deflection=left_out_deflection(case, basis),
-        passage=passage,
+        passage=_passage(structure, case, step),
     )
 
 
@@ -277,7 +308,8 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
         adc_bias=jnp.asarray(electronics.conditioner_bias),
         adc_step=jnp.asarray(electronics.adc_range / electronics.adc_levels),
         adc_top=jnp.asarray(electronics.adc_levels - 1.0),
-        adc_noise=jnp.asarray(electronics.adc_noise),
+        adc_noise=_converter_noise(case),
+        notch=design_notch(control, electronics.period) if structure.has_notch else None,
     )
     return ControllerDesign(
         controller=with_gains(controller, control.gain_factor),
@@ -286,6 +318,15 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
         sensor_condition=condition_number(seen, mask),
         actuator_condition=condition_number(driven, mask),
     )
+
+
+def _converter_noise(case: Case) -> Array:
+    """Noise at the ADC's input, of strain gauges with that of their amplifiers [V], ()."""
+    electronics, patches = case.electronics, case.machine.patches
+    own = electronics.conditioner_gain * patches.gauge_noise
+    is_more = (patches.is_gauge > 0) & (own > 0)
+    both = jnp.sqrt(jnp.where(is_more, electronics.adc_noise**2 + own**2, 1.0))
+    return jnp.where(is_more, both, electronics.adc_noise)
 
 
 def _believed_damping(case: Case, omega: Array) -> Array:
@@ -360,6 +401,7 @@ def _static_status(
         ),
         (jnp.any(zeta >= 1), status.OVERDAMPED),
         (_has_unplaceable_poles(structure, case, design), status.UNPLACEABLE),
+        (_is_delay_off(structure, case), status.DELAY_OFF),
         (
             ~jnp.all((windows.stations > 0) & (windows.stations < 1)),
             status.STATION_OFF_LINK,
@@ -423,6 +465,11 @@ def _has_unplaceable_poles(structure: Structure, case: Case, design: ControllerD
     return is_unplaceable(structure, case, design.nominal)
 
 
+def _is_delay_off(structure: Structure, case: Case) -> Array:
+    delay = true_delay(case.electronics)
+    return ((delay < 0) | (delay > LONGEST)) & structure.is_delayed
+
+
 def _is_too_fast(structure: Structure, case: Case, bases: Bases) -> Array:
     """Whether a filter or the shaper is beyond half the sample rate."""
     half = jnp.pi / case.electronics.period
@@ -433,4 +480,5 @@ def _is_too_fast(structure: Structure, case: Case, bases: Bases) -> Array:
     has_lowpass = case.electronics.estimator == KINDS.index("modal_phase")
     is_fast |= (lowpass_corner(structure, case, bases) >= half) & has_lowpass
     is_fast |= case.electronics.sensor_highpass >= half
+    is_fast |= jnp.any(case.control.notch >= half)
     return is_fast | (case.electronics.antialias >= half)

@@ -15,17 +15,27 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
+from jaxmodel.delay import true_delay
 from jaxmodel.estimator import Estimator
 from jaxmodel.frequency_response import PlantResponse, plant_response
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import Loop
+from jaxmodel.notch import Notch
 from jaxmodel.pairs import Pair, determinant, product
 from jaxmodel.parameters import Array
+from jaxmodel.trigonometry import sine_cosine
 
 #: Images n of the spectrum that are summed; those left out change the sum by 1e-4.
 IMAGES = (0, -1, 1, -2)
 #: Modes are taken to be at least as wide as this share of their frequency [1].
 NARROWEST = 1e-6
+
+
+class Lateness(NamedTuple):
+    """Delay of the commands beyond one sample."""
+
+    time: Array  # tau [s], ()
+    images: Pair  # exp(-j 2 pi n tau/T) of the `IMAGES`, (4,)
 
 
 class LoopResponse(NamedTuple):
@@ -53,6 +63,8 @@ class LoopResponse(NamedTuple):
     antialias: Array  # [rad/s], ()
     highpass: Array | None  # of the patches [rad/s], None if there is none, ()
     lag: Array | None  # of the amplifiers [s], None if there are none, ()
+    late: Lateness | None = None  # None: the delay is one sample
+    notch: Notch | None = None  # of the links with channels, (n, 1) each
 
 
 def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> LoopResponse:
@@ -91,7 +103,15 @@ def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
         antialias=plant.antialias,
         highpass=plant.highpass,
         lag=plant.lag,
+        late=_lateness(case) if structure.has_delay else None,
+        notch=jax.tree.map(lambda x: x[:, None], loop.controller.notch),
     )
+
+
+def _lateness(case: Case) -> Lateness:
+    late = true_delay(case.electronics) - 1
+    angle = 2 * np.pi * np.array(IMAGES) * late
+    return Lateness(late * case.electronics.period, Pair(jnp.cos(angle), -jnp.sin(angle)))
 
 
 def loop_strength(response: LoopResponse) -> Array:
@@ -131,6 +151,7 @@ _CHANNEL_FIELDS = (
     "estimator",
     "velocity_gain",
     "position_gain",
+    "notch",
 )
 
 
@@ -221,13 +242,14 @@ def evaluate_loop_gain(
             eigenvalues [1], (n, C); None: nothing.
     """
     n, gains, shares = response.observe.shape[0], [], []
+    late = None if response.late is None else delayed(s, response.late.time)
     # kernels write them once
     link_gain, pose_share = jax.jit(_link_gain), jax.jit(_share_in_pose)
     for i in range(response.square.shape[0]):
         link = _one_link(response, i, i < n)
         if i < n:
             apart = None if spread is None else spread[i : i + 1]
-            *gain, share = link_gain(link, s, shift, apart)
+            *gain, share = link_gain(link, s, shift, late, apart)
             gains.append(gain)
         else:
             share = pose_share(link, s)
@@ -248,17 +270,19 @@ def _one_link(response: LoopResponse, i: int, has_channels: bool) -> LoopRespons
 
 
 def _link_gain(
-    response: LoopResponse, s: Pair, shift: Pair, spread: Array | None
+    response: LoopResponse, s: Pair, shift: Pair, late: Pair | None, spread: Array | None
 ) -> tuple[list[Pair], list[Pair], Pair]:
     """`own` and `joint` of a link's `LoopGain`, and its share in the pose's stiffness, (3, 3)."""
     observe, act = response.observe, response.act
     sampling = 2 * np.pi / response.period
     held = -shift + 1.0
     seen = None
-    for image in IMAGES:
+    for k, image in enumerate(IMAGES):
         at = Pair(s.re, s.im + image * sampling)
         at2 = at * at
         chain = _electronics(response, at, at2, held)
+        if late is not None and response.late is not None:
+            chain = chain * (late * response.late.images[k])
         inertia = 1.0 if image == 0 else response.lightness
         inverse = (at2 * inertia + at * response.decay + response.square).inverse()
         part = (_through(observe, act, inverse) + response.direct) * chain
@@ -301,6 +325,26 @@ def _electronics(response: LoopResponse, s: Pair, s2: Pair, held: Pair) -> Pair:
     return above * below.inverse()
 
 
+#: exp of a number up to 40 by `delayed`: that of a 64th by its series.
+_HALVINGS, _TERMS = 6, 14
+
+
+def delayed(s: Pair, time: Array) -> Pair:
+    """exp(-s tau) by elementwise arithmetic, ().
+
+    Args:
+        s: [1/s], ().
+        time: tau [s], ().
+    """
+    decay, size = s.re * time * (-1 / 2**_HALVINGS), jnp.ones_like(s.re)
+    for n in range(_TERMS, 0, -1):
+        size = 1 + decay * size * (1 / n)
+    for _ in range(_HALVINGS):
+        size = size * size
+    sine, cosine = sine_cosine(s.im * time)
+    return Pair(size * cosine, -size * sine)
+
+
 def _channel(response: LoopResponse, shift: Pair) -> Pair:
     """Force of each channel per channel signal, one sample later, (n, C)."""
     estimator, shift2 = response.estimator, shift * shift
@@ -317,6 +361,9 @@ def _channel(response: LoopResponse, shift: Pair) -> Pair:
     force = above * section(b0, b1, zero) * below.inverse()
     if response.position_gain is not None:
         force = force + response.position_gain * estimator.direct
+    if response.notch is not None:
+        b0, b1, b2, a1, a2 = response.notch
+        force = force * (section(b0, b1, b2) * section(1 + 0 * a1, a1, a2).inverse())
     return -(force * shift)
 
 

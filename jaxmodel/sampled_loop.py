@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, controller_step, rest_controller, with_gains
+from jaxmodel.delay import LONGEST, command_change, true_delay
 from jaxmodel.drive import Reference, drive_step
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import DriveState, resting_drive
@@ -83,10 +84,10 @@ def loop_matrices(
     drive = DRIVES[structure.drive]
     plant = linearise(smooth, loop, pose, moment, drive.is_sampled)
     analogue = _with_electronics(smooth, plant, case)
-    exact = _over_a_sample(analogue, case.electronics.period)
+    exact = _over_a_sample(smooth, analogue, case)
     from jax.flatten_util import ravel_pytree
 
-    n, n_sensors = len(exact), 3 * structure.n_patches
+    n = len(exact.held)
     no_reference = jnp.zeros((6,), analogue.state.dtype)
     rest, unpack = ravel_pytree((rest_controller(law), resting_drive(drive, no_reference[:3])))
 
@@ -94,8 +95,9 @@ def loop_matrices(
         before, servo = unpack(x[n:])
         filtered = jnp.reshape(x[analogue.filtered], before.voltage.shape)
         after, _ = controller_step(with_gains(law, factor), before, filtered, None, True)
-        inputs = jnp.concatenate([x[:n], jnp.ravel(before.voltage)])
-        moved = _moved(exact, inputs, servo)
+        moved = _moved(exact, jnp.concatenate([x[:n], jnp.ravel(before.voltage)]), servo)
+        if exact.newest is not None:
+            moved = moved + exact.newest @ jnp.ravel(after.voltage)
         servo = _next_drive(smooth, case, loop, plant, x, servo, reference)
         return jnp.concatenate([moved, ravel_pytree((after, servo))[0]])
 
@@ -104,9 +106,11 @@ def loop_matrices(
     without = jacobian(start, 0.0, no_reference)
 
     def deflected(x: Array) -> Array:
-        voltage = (
-            jnp.ravel(unpack(x[n:])[0].voltage) if analogue.voltage is None else x[analogue.voltage]
-        )
+        if analogue.voltage is not None:
+            voltage = x[analogue.voltage]
+        else:
+            commands = jnp.ravel(unpack(x[n:])[0].voltage)
+            voltage = exact.present @ jnp.concatenate([x[:n], commands])
         bent = plant.deflection @ x[: plant.deflection.shape[1]]
         return bent + plant.direct_deflection @ voltage
 
@@ -114,17 +118,16 @@ def loop_matrices(
         open=without,
         feedback=jacobian(start, 1.0, no_reference) - without,
         plant=linearise(smooth, loop, pose, moment).state if drive.is_sampled else plant.state,
-        force=jnp.pad(exact[:, n + n_sensors :], ((0, start.size - n), (0, 0))),
+        force=jnp.pad(exact.force, ((0, start.size - n), (0, 0))),
         deflection=jax.jacfwd(deflected)(start),
         reference=jax.jacfwd(advance, 2)(start, 0.0, no_reference) if drive.is_sampled else None,
     )
 
 
-def _moved(exact: Array, inputs: Array, servo: DriveState | None) -> Array:
+def _moved(exact: _Sampled, inputs: Array, servo: DriveState | None) -> Array:
     """Analogue state one sample later, from state and voltages, and the force of the drive."""
-    if servo is None:
-        return exact[:, : inputs.size] @ inputs
-    return exact @ jnp.concatenate([inputs, servo.force])
+    moved = exact.held @ inputs
+    return moved if servo is None else moved + exact.force @ servo.force
 
 
 def _next_drive(
@@ -159,36 +162,18 @@ def delayed_loop(
 ) -> Array:
     """Transition matrix of the closed loop whose commands come later still, (m, m).
 
-    Over the first part of a sample the actuators hold the command before the last one.
-
     Args:
         structure: static choices with feedback "sampled".
         case: the numbers.
         pose: where to linearise, at rest under the steady load [m, m, rad], (3,).
         law: controller.
-        delay: beyond the one sample of computing, 0 to 1 [samples], ().
+        delay: beyond that of the case, which with it is at most `delay.LONGEST` [samples], ().
     """
-    smooth = structure._replace(is_smooth=True, feedback="sampled")
-    loop = prepare(smooth, case).loop
-    plant = linearise(smooth, loop, pose, resting(structure, case))
-    analogue, period = _with_electronics(smooth, plant, case), case.electronics.period
-    earlier, later = (_over_a_sample(analogue, part * period) for part in (delay, 1 - delay))
-    from jax.flatten_util import ravel_pytree
-
-    n, n_sensors = len(earlier), 3 * structure.n_patches
-    rest, unpack = ravel_pytree(rest_controller(law))
-
-    def advance(x: Array) -> Array:
-        before, old = unpack(x[n:-n_sensors]), x[-n_sensors:]
-        held = jnp.ravel(before.voltage)
-        filtered = jnp.reshape(x[analogue.filtered], before.voltage.shape)
-        after, _ = controller_step(law, before, filtered, None, True)
-        moved = earlier[:, : n + n_sensors] @ jnp.concatenate([x[:n], old])
-        moved = later[:, : n + n_sensors] @ jnp.concatenate([moved, held])
-        return jnp.concatenate([moved, ravel_pytree(after)[0], held])
-
-    start = jnp.zeros((n + rest.size + n_sensors,), analogue.state.dtype)
-    return jax.jacfwd(advance)(start)
+    electronics = case.electronics
+    electronics = electronics._replace(unmodelled_delay=electronics.unmodelled_delay + delay)
+    later = case._replace(electronics=electronics)
+    matrices = closed_loop(structure._replace(has_delay=True), later, pose, law)
+    return matrices.open + matrices.feedback
 
 
 class SampledPlant(NamedTuple):
@@ -220,14 +205,14 @@ def sampled_plant(structure: Structure, case: Case, pose: Array) -> SampledPlant
     loop, drive = prepare(smooth, case).loop, DRIVES[structure.drive]
     plant = linearise(smooth, loop, pose, resting(structure, case), drive.is_sampled)
     analogue = _with_electronics(smooth, plant, case)
-    exact = _over_a_sample(analogue, case.electronics.period)
+    exact = _over_a_sample(smooth, analogue, case)
     from jax.flatten_util import ravel_pytree
 
-    n, n_sensors = len(exact), 3 * structure.n_patches
-    no_reference = jnp.zeros((6,), exact.dtype)
+    n, n_sensors = len(exact.held), 3 * structure.n_patches
+    no_reference = jnp.zeros((6,), exact.held.dtype)
     rest, unpack = ravel_pytree(resting_drive(drive, no_reference[:3]))
     m = n + rest.size
-    eye = jnp.eye(n_sensors, dtype=exact.dtype)
+    eye = jnp.eye(n_sensors, dtype=exact.held.dtype)
 
     def advance(x: Array) -> Array:
         servo = unpack(x[n:m])
@@ -235,11 +220,12 @@ def sampled_plant(structure: Structure, case: Case, pose: Array) -> SampledPlant
         servo = _next_drive(smooth, case, loop, plant, x, servo, no_reference)
         return jnp.concatenate([moved, ravel_pytree(servo)[0]])
 
-    held = jax.jacfwd(advance)(jnp.zeros((m + n_sensors,), exact.dtype))
+    held = jax.jacfwd(advance)(jnp.zeros((m + n_sensors,), eye.dtype))
+    enter = jnp.pad(eye, ((m, 0), (0, 0)))
     return SampledPlant(
         state=jnp.pad(held, ((0, n_sensors), (0, 0))),
-        enter=jnp.pad(eye, ((m, 0), (0, 0))),
-        leave=jnp.zeros((n_sensors, m + n_sensors), exact.dtype).at[:, analogue.filtered].set(eye),
+        enter=enter if exact.newest is None else enter.at[:n].set(exact.newest),
+        leave=jnp.zeros((n_sensors, m + n_sensors), eye.dtype).at[:, analogue.filtered].set(eye),
     )
 
 
@@ -253,8 +239,52 @@ class _Analogue(NamedTuple):
     size: Array  # typical size of each entry of the state, (n,)
 
 
-def _over_a_sample(analogue: _Analogue, period: Array) -> Array:
-    """Exact transition over a sample with held commands and forces, (n, n + 3 K + 3)."""
+class _Sampled(NamedTuple):
+    """Exact over a sample; commands on their way are part of the state, u_(k-2) first."""
+
+    held: Array  # by the state and u_(k-1), (n, n + 3 K)
+    newest: Array | None  # by u_k, if its delay can be below a sample, (n, 3 K)
+    force: Array  # by slider forces held over the sample, (n, 3)
+    present: Array  # command on the actuators, of state and u_(k-1), (3 K, n + 3 K)
+
+
+def _over_a_sample(structure: Structure, analogue: _Analogue, case: Case) -> _Sampled:
+    """Transition of plant and electronics from sample to sample."""
+    period, n_sensors = case.electronics.period, 3 * structure.n_patches
+    eye = jnp.eye(n_sensors, dtype=analogue.state.dtype)
+    if not structure.has_delay:
+        exact = _held_transition(analogue, period)
+        n = len(exact)
+        held, force = exact[:, : n + n_sensors], exact[:, n + n_sensors :]
+        return _Sampled(held, None, force, jnp.pad(eye, ((0, 0), (n, 0))))
+    change = command_change(true_delay(case.electronics))
+    first, second = (
+        _held_transition(analogue, share * period) for share in (change.share, 1 - change.share)
+    )
+    n = len(first)
+    whole = second[:, :n] @ first
+    force = whole[:, n + n_sensors :] + second[:, n + n_sensors :]
+    newest, last, *older = (
+        a * whole[:, n : n + n_sensors] + b * second[:, n : n + n_sensors]
+        for a, b in zip(change.before, change.after, strict=True)
+    )
+    # one queue: u_(k-1) enters as u_(k-2), each older one moves on
+    queue = jnp.eye((LONGEST - 1) * n_sensors, LONGEST * n_sensors, -n_sensors, eye.dtype)
+    queue = queue.at[:n_sensors, -n_sensors:].set(eye)
+    below = jnp.pad(queue, ((0, 0), (n, 0)))
+    above = jnp.concatenate([whole[:, :n], *older, last], axis=1)
+    present = jnp.concatenate([share * eye for share in (*change.before[2:], change.before[1])], 1)
+    ahead = ((0, len(queue)), (0, 0))
+    return _Sampled(
+        held=jnp.concatenate([above, below]),
+        newest=jnp.pad(newest, ahead),
+        force=jnp.pad(force, ahead),
+        present=jnp.pad(present, ((0, 0), (n, 0))),
+    )
+
+
+def _held_transition(analogue: _Analogue, period: Array) -> Array:
+    """Exact transition over a time with held commands and forces, (n, n + 3 K + 3)."""
     n, n_inputs = analogue.enters.shape
     held = jnp.zeros((n + n_inputs,) * 2, analogue.state.dtype)
     held = held.at[:n, :n].set(analogue.state).at[:n, n:].set(analogue.enters)

@@ -12,6 +12,7 @@ from jaxmodel import metrics, status
 from jaxmodel.axial import axial_force, critical_force, euler_force
 from jaxmodel.case import Case, Load, Structure
 from jaxmodel.controller import Controller
+from jaxmodel.delay import command_change, true_delay
 from jaxmodel.drives import DRIVES
 from jaxmodel.dynamics import inverse_dynamics
 from jaxmodel.kinematics import inverse_kinematics, path_status, singularity_distance
@@ -61,10 +62,11 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
     Returns:
         Command.
     """
-    n, per_sample = structure.n_steps, 2 * structure.substeps
+    n, per_sample = structure.n_steps, 2 * structure.plant_steps
     period, plant = case.electronics.period, prepared.loop.plant
     grid = n * per_sample + 1
-    reference = shape_path(case.path, prepared.taps, grid, per_sample, period / per_sample)
+    within = _points_in_a_sample(structure, case) if structure.is_delayed else None
+    reference = shape_path(case.path, prepared.taps, grid, per_sample, period / per_sample, within)
     rest = prepared.loop.rest
     wrench = case.load.wrench if structure.has_wrench else None
     sliders: Callable[..., Any] = partial(inverse_kinematics, plant)
@@ -115,6 +117,13 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
         bad_time=bad_time,
         singularity_distance=distance,
     )
+
+
+def _points_in_a_sample(structure: Structure, case: Case) -> Array:
+    """When the drive reads its reference, before and after a command changes [s], (P - 1,)."""
+    share = command_change(true_delay(case.electronics)).share
+    grid = np.arange(structure.plant_steps) / structure.plant_steps
+    return case.electronics.period * jnp.concatenate([share * grid, share + (1 - share) * grid])
 
 
 def _about(function: Callable[..., Any], pose: Array) -> Callable[..., Any]:

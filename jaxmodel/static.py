@@ -27,6 +27,7 @@ class Pieces(NamedTuple):
     right: Array  # [m], (n,)
     has_sensor: Array  # 1 where sensor k covers it, else 0, (K, n)
     has_actuator: Array  # 1 where actuator k covers it, else 0, (K, n)
+    has_ceramic: Array  # 1 where a sensor that is a patch covers it, else 0, (K, n)
 
 
 def link_pieces(beam: Beam, patches: Patches) -> Pieces:
@@ -47,7 +48,14 @@ def link_pieces(beam: Beam, patches: Patches) -> Pieces:
         left, right = (end[:, None] for end in ends)
         return ((left < middle) & (middle < right)).astype(cuts.dtype)
 
-    return Pieces(cuts[:-1], cuts[1:], covers(sensor), covers(actuator))
+    seen = covers(sensor)
+    return Pieces(
+        left=cuts[:-1],
+        right=cuts[1:],
+        has_sensor=seen,
+        has_actuator=covers(actuator),
+        has_ceramic=seen * (1.0 - patches.is_gauge),
+    )
 
 
 def section_stiffness(beam: Beam, patches: Patches, pieces: Pieces, has_patches: bool) -> Array:
@@ -62,7 +70,7 @@ def section_stiffness(beam: Beam, patches: Patches, pieces: Pieces, has_patches:
     if has_patches:
         single = one_sided_section(beam, patches).stiffness
         double = two_sided_section(beam, patches).stiffness
-        one, other = pieces.has_sensor, pieces.has_actuator
+        one, other = pieces.has_ceramic, pieces.has_actuator
         stiffness = stiffness + single * jnp.sum(one + other, axis=0)
         stiffness = stiffness + (double - 2 * single) * jnp.sum(one * other, axis=0)
     return stiffness * beam.stiffness_factor

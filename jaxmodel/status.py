@@ -28,6 +28,7 @@ NEAR_SINGULAR = 20
 OVERLOADED = 21
 OVERDAMPED = 22
 UNPLACEABLE = 23
+DELAY_OFF = 24
 
 #: A case with one of these statuses ran to its end, and its metrics are valid.
 FINISHED = (
@@ -68,4 +69,5 @@ REASONS = {
     OVERDAMPED: "a link mode with a damping ratio of 1 or more",
     UNPLACEABLE: "poles that cannot be placed: no decay, one beyond the mode's frequency without "
     "a frequency given, beyond half the sample rate, or estimates in phase",
+    DELAY_OFF: "delay of the commands beyond 0 to 4 samples",
 }

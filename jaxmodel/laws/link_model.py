@@ -1,11 +1,12 @@
 """The sampled plant in the nominal model of a controller with an observer, link by link.
 
 Modes at their assembled frequencies, drained patches, anti-alias filter, amplifiers and hold, exact
-over a sample, and the sample of delay. Sensors answer to all other modes at once
+over a sample, and the delay that the controller knows. Sensors answer to all other modes at once
 (`jaxmodel.static`). Each mode is in coordinates whose squares are energies,
 sqrt(m) omega q and sqrt(m) q', and so are its filters. States: all q, all rates, all z, all rates
 of z, all s if patches are drained; of each patch the voltages on their way to the sensors and, if
-there are amplifiers, on the actuators; commands of the last sample.
+there are amplifiers, on the actuators; commands of the last sample, after older ones if the delay
+is not one sample.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from jaxmodel.case import Case, Electronics, Structure
+from jaxmodel.delay import LONGEST, CommandChange, command_change
 from jaxmodel.laws.contract import NominalModel, system_feedback
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
@@ -33,6 +35,8 @@ class LinkModel(NamedTuple):
     drive: Array  # W, state per modal force held over the sample [sqrt(J)/N], (n, C)
     sensor: Array  # C [V/sqrt(J)], (K, n)
     energy: Array  # diagonal of the modes' energy, 1 for their two states, (n,)
+    met: Array  # what the next command meets when it arrives, of x, (n, n)
+    held: Array  # state by a command on the actuators for a whole sample, (n, K)
 
 
 def link_model(structure: Structure, case: Case, nominal: NominalModel) -> LinkModel:
@@ -92,7 +96,8 @@ def layout(structure: Structure, n_modes: int, n_patches: int) -> dict[str, slic
     has_drain = structure.has_sensor_highpass
     of_modes = ["q", "rate", "z", "z_rate"] + ["s"] * has_drain
     of_patches = ["direct_z", "direct_z_rate"] + ["direct_s"] * has_drain
-    of_patches += ["volts"] * structure.has_amplifier + ["last"]
+    of_patches += ["volts"] * structure.has_amplifier
+    of_patches += [f"older_{k}" for k in range(structure.has_delay * (LONGEST - 1))] + ["last"]
     sizes = [n_modes] * len(of_modes) + [n_patches] * len(of_patches)
     begin = [sum(sizes[:k]) for k in range(len(sizes) + 1)]
     return {name: slice(*begin[k : k + 2]) for k, name in enumerate(of_modes + of_patches)}
@@ -111,7 +116,7 @@ def _one_link(
 ) -> LinkModel:
     electronics, n_modes, n_patches = case.electronics, omega.size, actuator.shape[1]
     at = layout(structure, n_modes, n_patches)
-    n, eye, corner = at["last"].start, jnp.eye(n_modes), electronics.antialias
+    n, eye, corner = _first_command(at), jnp.eye(n_modes), electronics.antialias
     a = jnp.zeros((n, n), omega.dtype)
     a = a.at[at["q"], at["rate"]].set(jnp.diag(omega)).at[at["rate"], at["q"]].set(-jnp.diag(omega))
     a = a.at[at["rate"], at["rate"]].set(-2 * zeta * jnp.diag(omega))
@@ -133,20 +138,80 @@ def _one_link(
     else:
         enter = (enter + shown).at[at["rate"]].set(bend)
     drive = jnp.zeros((n, n_modes), omega.dtype).at[at["rate"]].set(jnp.diag(on / root_mass))
-    held = jnp.concatenate([a, enter, drive], axis=1)
-    held = jnp.pad(held, ((0, held.shape[1] - n), (0, 0)))
-    exact = jax.scipy.linalg.expm(held * electronics.period)[:n]
+    between = jnp.concatenate([a, enter, drive], axis=1)
+    between = jnp.pad(between, ((0, between.shape[1] - n), (0, 0)))
     seen = jnp.zeros((n_patches, n), omega.dtype)
     seen = seen.at[:, at["z"]].set(sensor * on / (omega * root_mass))
     seen = seen.at[:, at["direct_z"]].set(direct)
-    last = ((0, n_patches), (0, 0))
+    moves = _moves(structure, electronics, between, n, n_patches)
+    size, more = at["last"].stop, ((0, at["last"].stop - n), (0, 0))
     return LinkModel(
-        state=jnp.pad(exact[:, : n + n_patches], last),
-        enter=jnp.concatenate([jnp.zeros_like(enter), jnp.eye(n_patches)]),
-        drive=jnp.pad(exact[:, n + n_patches :], last),
-        sensor=jnp.pad(seen, ((0, 0), (0, n_patches))),
-        energy=jnp.pad(jnp.tile(on, 2), (0, n + n_patches - 2 * n_modes)),
+        state=moves.state,
+        enter=moves.enter,
+        drive=jnp.pad(moves.whole[:, n + n_patches :], more),
+        sensor=jnp.pad(seen, ((0, 0), (0, size - n))),
+        energy=jnp.pad(jnp.tile(on, 2), (0, size - 2 * n_modes)),
+        met=moves.met,
+        held=jnp.pad(moves.whole[:, n : n + n_patches], more),
     )
+
+
+def _first_command(at: dict[str, slice]) -> int:
+    """Where commands begin in the model's state."""
+    begin: int = at.get("older_0", at["last"]).start
+    return begin
+
+
+class _Moves(NamedTuple):
+    """A link over a sample."""
+
+    whole: Array  # with everything held, (n, n + K + C)
+    state: Array  # with the commands that it has, see `LinkModel`
+    enter: Array
+    met: Array
+
+
+def _moves(
+    structure: Structure, electronics: Electronics, between: Array, n: int, n_patches: int
+) -> _Moves:
+    """Modes and electronics, x' = `between` (x, u, f), with commands after their delay."""
+    period, eye = electronics.period, jnp.eye(n_patches)
+    inputs = slice(n, n + n_patches)
+    if not structure.has_delay:
+        whole = jax.scipy.linalg.expm(between * period)[:n]
+        state = jnp.pad(whole[:, : n + n_patches], ((0, n_patches), (0, 0)))
+        enter = jnp.concatenate([jnp.zeros((n, n_patches), whole.dtype), eye])
+        return _Moves(whole, state, enter, state)
+    change = command_change(electronics.delay)
+    first, second = (
+        jax.scipy.linalg.expm(between * share * period)[:n]
+        for share in (change.share, 1 - change.share)
+    )
+    free = second[:, :n] @ first
+    newest, last, *older = (
+        a * free[:, inputs] + b * second[:, inputs]
+        for a, b in zip(change.before, change.after, strict=True)
+    )
+    whole = jnp.concatenate([free[:, :n], free[:, n:] + second[:, n:]], axis=1)
+    above = jnp.concatenate([free[:, :n], *older[::-1], last], axis=1)
+    # commands move on by one place, oldest first
+    queue = jnp.eye(LONGEST * n_patches, k=n_patches, dtype=whole.dtype)
+    state = jnp.concatenate([above, jnp.pad(queue, ((0, 0), (n, 0)))])
+    enter = jnp.concatenate([newest, jnp.zeros(((LONGEST - 1) * n_patches, n_patches)), eye])
+    return _Moves(whole, state, enter, _met(state, first, change, n, n_patches))
+
+
+def _met(state: Array, first: Array, change: CommandChange, n: int, n_patches: int) -> Array:
+    """What u_k meets after its delay: whole samples without it, and the part until it changes."""
+    arriving = jnp.concatenate(
+        [share * jnp.eye(n_patches) for share in (*change.before[:0:-1],)], axis=1
+    )
+    part = jnp.concatenate([first[:, :n], first[:, n : n + n_patches] @ arriving], axis=1)
+    part = jnp.pad(part, ((0, len(state) - n), (0, 0)))
+    met, power = part * change.before[1], state
+    for samples in change.before[2:]:
+        met, power = met + samples * (part @ power), state @ power
+    return met
 
 
 def _direct_path(a: Array, at: dict[str, slice], electronics: Electronics) -> tuple[Array, Array]:

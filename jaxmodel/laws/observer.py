@@ -81,8 +81,8 @@ def _own_blocks(structure: Structure, case: Case, nominal: NominalModel) -> Arra
 def regulator(structure: Structure, case: Case, nominal: NominalModel, model: LinkModel) -> Array:
     """K of u_k = -K x_k that places the poles of every mode, (3, K, n).
 
-    u_k acts from sample k+1 on, where x_(k+1) = F x_k is known: it holds all commands on their way.
-    Of each mode, x_(k+1) gives xi = (q, q') and, behind amplifiers, the modal force that still
+    u_k acts from its arrival on, when x is known: it depends on the commands on their way alone.
+    Of each mode, x gives xi = (q, q') and, behind amplifiers, the modal force that still
     rises. With f = -k xi held over a sample, Ackermann's formula k = e^t (gamma, Phi gamma, ..)^-1
     p(Phi) puts the poles at exp(s T), where s are those of continuous feedback, (20)-(23);
     amplifiers keep theirs.
@@ -101,7 +101,7 @@ def regulator(structure: Structure, case: Case, nominal: NominalModel, model: Li
     own = [each[name].start for name in ("q", "rate", "volts") if name in each]
     single = mode_models(structure, case, nominal, nominal.damping_ratio)
     phi = single.state[:, :, jnp.array(own)[:, None], jnp.array(own)]
-    gamma = single.state[:, :, jnp.array(own), each["last"].start]
+    gamma = single.held[:, :, jnp.array(own), 0]
 
     def one(phi: Array, gamma: Array, total: Array, product: Array) -> Array:
         polynomial = phi @ phi - total * phi + product * jnp.eye(len(own))
@@ -111,9 +111,9 @@ def regulator(structure: Structure, case: Case, nominal: NominalModel, model: Li
 
     gain = jax.vmap(jax.vmap(one))(phi, gamma, total, product)  # (3, C, 2 or 3)
     gain = gain * acting_channels(case, nominal)[..., None]
-    rows = [model.state[:, at["q"]], model.state[:, at["rate"]]]
+    rows = [model.met[:, at["q"]], model.met[:, at["rate"]]]
     if "volts" in at:
-        rows.append(nominal.actuator @ model.state[:, at["volts"]])
+        rows.append(nominal.actuator @ model.met[:, at["volts"]])
     force = jnp.einsum("icr,ricn->icn", gain, jnp.stack(rows))
     return nominal.synthesizer @ force
 

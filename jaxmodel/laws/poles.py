@@ -23,6 +23,7 @@ from jaxmodel.estimator import Estimator, responses
 from jaxmodel.laws.contract import NominalModel, acting_channels, study_estimator, study_gains
 from jaxmodel.laws.link_model import LinkModel, mode_models
 from jaxmodel.lazy import jnp
+from jaxmodel.notch import Notch, design_notch, notch_response
 from jaxmodel.parameters import Array
 
 #: Added decay over omega below which a mode is left alone [1].
@@ -84,6 +85,10 @@ def sampled_gains(
     decay = jnp.where(is_moved, poles.decay, poles.decay + 0.1 * nominal.omega)
     z = jnp.exp((-decay + 1j * poles.frequency) * case.electronics.period)
     rate, value = responses(estimator, z)
+    if structure.has_notch:
+        notch = design_notch(case.control, case.electronics.period)
+        passed = notch_response(Notch(*(x[:, None] for x in notch)), z)
+        rate, value = rate * passed, value * passed
     gain = -1 / pulse_transfer(structure, case, nominal, z)
     area = jnp.imag(jnp.conj(rate) * value)
     is_solved = is_moved & ~_is_flat(rate, value)

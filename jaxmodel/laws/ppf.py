@@ -49,7 +49,8 @@ def design_position_filter(omega: Array, zeta: Array, electronics: Electronics) 
         PositionFilter; where `damping` is not positive, the chain lags too much for this law.
     """
     period, share = electronics.period, omega / electronics.antialias
-    lag = jnp.arctan2(jnp.sqrt(2.0) * share, 1 - share**2) + 1.5 * omega * period
+    lag = jnp.arctan2(jnp.sqrt(2.0) * share, 1 - share**2)
+    lag = lag + (0.5 + electronics.delay) * omega * period
     lag = lag + jnp.arctan(omega * electronics.amplifier_lag)
     lag = lag - jnp.arctan(electronics.sensor_highpass / omega)
     least = jnp.arctan(2 * zeta * HIGHEST_RATIO / (HIGHEST_RATIO**2 - 1))

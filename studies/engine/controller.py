@@ -75,6 +75,13 @@ def fixed_controller(study: Study) -> FixedController:
     )
 
 
+def check_codable(study: Study) -> None:
+    """Raise StudyError for a controller that `studies export` has no code for."""
+    hertz = study.control.notch_hz
+    if any(hertz):
+        raise field_error("control.notch_hz", hertz, "0, since exports have no notch filters", "Hz")
+
+
 def _check_exportable(study: Study) -> None:
     control, electronics = study.control, study.electronics
     step = electronics.adc_range / 2**electronics.adc_bits

@@ -53,7 +53,7 @@ _FUNCTIONS: dict[Any, BlockFunction] = {}
 
 def stepper(structure: Structure) -> str:
     """The fastest way to step cases of a structure here, a key of `STEPPERS`."""
-    if not llvm.is_available() or structure.substeps > KERNEL_SUBSTEPS:
+    if not llvm.is_available() or structure.plant_steps > KERNEL_SUBSTEPS:
         return "scan"
     if processor() == "cpu":
         return "kernel" if bridge.is_available() else "scan"

@@ -272,14 +272,15 @@ def local_layout(n: int, structure: Structure) -> Layout:
     """
     devices = len(jax.local_devices())
     # a case's command takes most memory: references at every point of every step
-    points = structure.n_steps * (2 * structure.substeps + 1)
+    points = structure.n_steps * (2 * structure.plant_steps + 1)
     lane_bytes = points * 3 * 8 * 8 + 2**16
     lanes, unit = most_lanes(), lane_unit()
     while lanes > unit and devices * lanes * lane_bytes > memory_budget():
         lanes //= 2
     per_device = -(-n // devices)
     lanes = min(lanes, -(-per_device // unit) * unit)
-    preferred = min(max(CHUNK_WORK // (structure.n_steps * structure.substeps), 1), LARGEST_CHUNK)
+    work = structure.n_steps * structure.plant_steps
+    preferred = min(max(CHUNK_WORK // work, 1), LARGEST_CHUNK)
     blocks = max(min(preferred, n) // (devices * lanes), 1)
     return Layout(devices, blocks, lanes)
 

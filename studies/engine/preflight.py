@@ -132,6 +132,8 @@ def _without_run(structure: Structure) -> Structure:
         "has_poles",
         "has_amplifier",
         "has_sensor_highpass",
+        "has_delay",
+        "has_notch",
     )
     fields = {name: getattr(structure, name) for name in kept}
     return Structure(n_steps=1, feedback="none", **fields)

@@ -11,6 +11,7 @@ import scipy
 from jaxmodel.bases import find_bases
 from jaxmodel.beam import build_basis
 from jaxmodel.case import Case, Structure
+from jaxmodel.delay import command_change, true_delay
 from jaxmodel.metrics import METRICS
 from jaxmodel.prepare import left_out_deflection, spectrum_frequencies
 from jaxmodel.simulate import Result
@@ -188,8 +189,14 @@ def _applied_voltage(run: Run) -> np.ndarray:
     if not run.structure.has_amplifier:
         return command
     electronics = run.case.electronics
-    kept = np.exp(-electronics.period / electronics.amplifier_lag)
-    return scipy.signal.lfilter([0.0, 1 - kept], [1.0, -kept], command, axis=0)
+    # of a sample, the share until its command changes to that of the next one
+    share = 1.0
+    if run.structure.is_delayed:
+        share = float(command_change(true_delay(electronics)).share) or 1.0
+    kept, later = (
+        np.exp(-x * electronics.period / electronics.amplifier_lag) for x in (1.0, 1 - share)
+    )
+    return scipy.signal.lfilter([1 - later, later - kept], [1.0, -kept], command, axis=0)
 
 
 def run_attributes(study: Study) -> dict[str, Any]:

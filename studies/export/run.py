@@ -9,7 +9,7 @@ from typing import NamedTuple
 from rich.console import Console
 
 from studies import config
-from studies.engine.controller import FixedController, fixed_controller
+from studies.engine.controller import FixedController, check_codable, fixed_controller
 from studies.engine.design import Design
 from studies.errors import StudyError, field_error, nearest
 from studies.export.compiler import NO_COMPILER, find_compiler
@@ -83,6 +83,7 @@ def export_design(
         is_verified = False
     is_verified = True if is_verified is None else is_verified
 
+    check_codable(design.study)
     exported = fixed_controller(design.study)
     job = Job(
         exported=exported,

@@ -191,6 +191,7 @@ def plant_structure(design: FixedController, basis: str, n_modes: int) -> Struct
         has_wrench=nominal.has_wrench,
         has_sensor_highpass=nominal.has_sensor_highpass,
         has_amplifier=nominal.has_amplifier,
+        has_delay=nominal.has_delay,
     )
 
 

@@ -36,17 +36,22 @@ from studies.study.spec import OWN_DRIVES, OWN_LAWS, Study
 
 Tree = TypeVar("Tree")  # a Case, or numbers
 TWO_PI = 2 * np.pi
-#: What the program needs only where one of these fields is not 0, of poles: given at all.
+#: What the program needs only where one of these fields is not 0, or not its value in `NEUTRAL`;
+#: of poles: given at all.
 SWITCHES = {
     "has_wrench": ("load.wrench", "load.pulse"),
     "has_payload_offset": ("load.offset",),
     "has_sensor_highpass": ("electronics.sensor_highpass_hz",),
     "has_amplifier": ("electronics.amplifier_hz",),
-    "has_noise": ("electronics.adc_noise", "drive.ripple"),
+    "has_delay": ("electronics.delay", "electronics.unmodelled_delay"),
+    "has_notch": ("control.notch_hz",),
+    "has_noise": ("electronics.adc_noise", "drive.ripple", "patches.gauge_noise"),
     "has_friction": ("drive.coulomb_friction",),
     "has_poles": ("control.damping", "control.pole_decay"),
     "has_position_gain": ("control.position_gain", "control.damping", "control.pole_decay"),
 }
+#: Values other than 0 at which a field of `SWITCHES` needs nothing.
+NEUTRAL = {"electronics.delay": 1.0}
 #: Duration of a move that only pads a path with fewer moves [s].
 NO_TIME = 1e-12
 
@@ -87,7 +92,7 @@ def build_structure(study: Study, columns: Columns | None = None) -> Structure:
 def _is_used(field: str, values: np.ndarray) -> bool:
     if field in SWITCHES["has_poles"]:  # added damping of 0 specifies poles, too; NaN is none
         return bool(np.any(values >= 0))
-    return bool(np.any(values != 0))
+    return bool(np.any(values != NEUTRAL.get(field, 0.0)))
 
 
 def with_used(structure: Structure, fields: Iterable[str]) -> Structure:
@@ -215,10 +220,20 @@ def _machine(numbers: Numbers, structure: Structure, xp: Any) -> Machine:
         beam=Beam(*(number(f"link.{name}") for name in Beam._fields)),
         patches=Patches(
             center=number("patches.centers"),
-            **{name: number(f"patches.{name}") for name in Patches._fields if name != "center"},
+            **{name: number(f"patches.{name}") for name in Patches._fields[1:9]},
+            is_gauge=1.0 * number("patches.sensor"),
+            gauge_factor=number("patches.gauge_factor"),
+            bridge=_bridge(numbers),
+            gauge_noise=number("patches.gauge_noise"),
         ),
         damping=_damping(numbers, xp),
     )
+
+
+def _bridge(numbers: Numbers) -> Any:
+    """Amplified voltage of a bridge per relative change of an arm's resistance [V]."""
+    excitation, gain = numbers["patches.gauge_excitation"], numbers["patches.gauge_gain"]
+    return excitation * gain * numbers["patches.gauge_arms"] / 4
 
 
 def _joint_angle(numbers: Numbers, xp: Any) -> Any:
@@ -293,6 +308,9 @@ def _control(numbers: Numbers, structure: Structure, xp: Any) -> Control:
         gain_factor=number("control.gain_factor"),
         is_per_mass=number("control.gain_unit").astype(float),
         feedthrough_factor=number("control.feedthrough_factor"),
+        notch=TWO_PI * number("control.notch_hz"),
+        notch_depth=number("control.notch_depth"),
+        notch_width=number("control.notch_width"),
         parameters={x.name: number(f"{OWN_LAWS}.{law.name}.{x.name}") for x in law.parameters},
         system=numbers.get("state_space"),
     )
@@ -336,8 +354,13 @@ def _electronics(numbers: Numbers, structure: Structure, xp: Any) -> Electronics
     return Electronics(
         period=1 / number("electronics.sample_rate_hz"),
         antialias=TWO_PI * number("electronics.antialias_hz"),
-        sensor_highpass=TWO_PI * number("electronics.sensor_highpass_hz"),
+        # nothing drains a strain gauge
+        sensor_highpass=TWO_PI
+        * number("electronics.sensor_highpass_hz")
+        * (1.0 - number("patches.sensor")),
         amplifier_lag=xp.where(bandwidth > 0, 1 / xp.where(bandwidth > 0, bandwidth, 1.0), 0.0),
+        delay=number("electronics.delay"),
+        unmodelled_delay=number("electronics.unmodelled_delay"),
         conditioner_gain=number("electronics.conditioner_gain"),
         conditioner_bias=number("electronics.conditioner_bias"),
         adc_range=number("electronics.adc_range"),

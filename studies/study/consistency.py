@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxmodel.beam import BASES
+from jaxmodel.delay import LONGEST
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import DriveLaw
 from jaxmodel.laws import LAWS
@@ -206,6 +207,11 @@ def _check_patches(study: Study) -> None:
                 f"centres at least {pitch:g} apart, so that no patches overlap{of_link}",
                 "m",
             )
+    drain = study.electronics.sensor_highpass_hz
+    if patches.sensor == "strain_gauge" and drain > 0:
+        raise field_error(
+            "electronics.sensor_highpass_hz", drain, "0 where patches.sensor = 'strain_gauge'", "Hz"
+        )
     widths = each_link(patches.width)
     for i in np.flatnonzero(widths > each_link(link.width) * (1 + 1e-9))[:1]:
         raise field_error(
@@ -273,6 +279,19 @@ def _check_sampling(study: Study) -> None:
             electronics.amplifier_hz,
             f"0 (no limit) or {SLOWEST_AMPLIFIER:g} and more",
             "Hz",
+        )
+    delay, more = electronics.delay, electronics.unmodelled_delay
+    if not 0 <= delay + more <= LONGEST:
+        raise field_error(
+            "electronics.unmodelled_delay",
+            more,
+            f"{-delay:g} to {LONGEST - delay:g} at electronics.delay = {delay:g}",
+            "samples",
+        )
+    notches = study.control.notch_hz
+    if max(notches) >= rate / 2:
+        raise field_error(
+            "control.notch_hz", notches, f"below half the sample rate, {rate / 2:g}", "Hz"
         )
     for value in study.shaper.frequencies_hz:
         if value >= rate / 2:

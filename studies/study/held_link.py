@@ -64,6 +64,8 @@ def _line(study: Study, i: int, with_patches: bool) -> tuple[np.ndarray, np.ndar
     x = np.linspace(0, of(link, "length"), _POINTS)
     faces = {"sensor_length": np.zeros_like(x), "actuator_length": np.zeros_like(x)}
     for name, cover in faces.items():
+        if name == "sensor_length" and patches.sensor == "strain_gauge":
+            continue  # neither heavy nor stiff
         for center in patch_centers(study)[i] if with_patches else ():
             half = of(patches, name) / 2
             # a point stands for the interval around it, of which a patch covers a share

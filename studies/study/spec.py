@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jaxmodel.beam import BASES
+from jaxmodel.delay import LONGEST
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import DriveLaw
 from jaxmodel.estimator import KINDS
@@ -43,6 +44,9 @@ Deflection = Annotated[float, Field(ge=-0.1, le=0.1)]
 Force = Annotated[float, Field(ge=-1e4, le=1e4)]
 Wrench = tuple[Force, Force, Force]
 Gain = Annotated[float, Field(ge=-1e9, le=1e9)]
+NotchHertz = Annotated[float, Field(ge=0, le=1e5)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Width = Annotated[float, Field(ge=1e-3, le=10)]
 Hertz = Annotated[float, Field(ge=0.1, le=1e5)]
 Zeta = Annotated[float, Field(ge=0, lt=1)]
 Time = Annotated[float, Field(ge=1e-4, le=100)]
@@ -209,7 +213,7 @@ class LinkSection(Section):
 
 
 class PatchesSection(Section):
-    """Piezo pairs: sensor and actuator on opposite faces share a centre; one number, or three."""
+    """Pairs of sensor and piezo actuator, which share a centre on opposite faces of a link."""
 
     centers: tuple[float, ...] | tuple[tuple[float, ...], ...] = described(
         (0.05, 0.10, 0.15),
@@ -241,6 +245,16 @@ class PatchesSection(Section):
     density: EachLink[Annotated[float, Field(ge=0, le=3e4)]] = described(
         7800.0, "kg/m3", "density of the ceramic", free=MACHINE
     )
+    sensor: Literal["piezo", "strain_gauge"] = described(
+        "piezo", "-", "sensors: piezo patches, or strain gauges of sensor_length on the bare face"
+    )
+    gauge_factor: float = described(
+        2.1, "1", "relative change of resistance over strain", gt=0, le=500, free=MACHINE
+    )
+    gauge_excitation: float = described(5.0, "V", "of the gauges' bridges", gt=0, le=100)
+    gauge_arms: int = described(2, "1", "active arms of a bridge's four", ge=1, le=4)
+    gauge_gain: float = described(1000.0, "1", "of the bridges' amplifiers", gt=0, le=1e6)
+    gauge_noise: float = described(0.0, "V", "rms behind these amplifiers", ge=0, le=10)
 
 
 class MotionSection(Section):
@@ -361,6 +375,15 @@ class ControlSection(Section):
     feedthrough_factor: float = described(
         0.0, "1", "subtracted share of the residual modes' feed-through", ge=0, le=1, free=DESIGN
     )
+    notch_hz: tuple[NotchHertz, NotchHertz, NotchHertz] = described(
+        (0.0, 0.0, 0.0), "Hz", "notch filter of each link between sensors and feedback; 0: none"
+    )
+    notch_depth: tuple[Share, Share, Share] = described(
+        (0.1, 0.1, 0.1), "1", "its gain at that frequency", free=DESIGN
+    )
+    notch_width: tuple[Width, Width, Width] = described(
+        (0.2, 0.2, 0.2), "1", "width of its stop band over that frequency", free=DESIGN
+    )
 
     @property
     def has_poles(self) -> bool:
@@ -407,6 +430,22 @@ class ElectronicsSection(Section):
     )
     amplifier_hz: float = described(
         0.0, "Hz", "bandwidth (-3 dB) of the actuators' amplifiers; 0: no limit", ge=0, le=1e6
+    )
+    delay: float = described(
+        1.0,
+        "samples",
+        "from a sample to its command on the actuators; the controller's model has it",
+        ge=0,
+        le=LONGEST,
+        free=MACHINE,
+    )
+    unmodelled_delay: float = described(
+        0.0,
+        "samples",
+        "more of it, unknown to the controller; both together 0 to 4",
+        ge=-LONGEST,
+        le=LONGEST,
+        free=MACHINE,
     )
     estimator: Annotated[str, OneOf(lambda: KINDS)] = described(
         "modal_phase", "-", "velocity estimate"

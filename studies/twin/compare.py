@@ -9,9 +9,11 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.beam import BASES
+from studies.engine.controller import check_codable
 from studies.engine.preflight import check_run
 from studies.engine.runs import Run, run_study, uncontrolled_twin
 from studies.errors import StudyError, field_error
+from studies.study.cases import build_structure
 from studies.study.labels import describe
 from studies.study.spec import Study
 from studies.twin.law import exported_law
@@ -91,6 +93,10 @@ def check_supported(study: Study) -> None:
         raise field_error("run.model", run.model, "'coupled' for studies twin", "-")
     if run.smooth:
         raise field_error("run.smooth", run.smooth, "false for studies twin", "-")
+    check_codable(study)
+    if build_structure(study).has_delay:
+        delay = study.electronics.delay + study.electronics.unmodelled_delay
+        raise field_error("electronics.delay", delay, "1 for studies twin", "samples")
     if not BASES[link.basis].is_on_chord:
         names = ", ".join(name for name, one in BASES.items() if one.is_on_chord)
         raise field_error("link.basis", link.basis, f"{names} for studies twin")

@@ -145,7 +145,7 @@ def _ends(patches: Patches, size: float, length: float) -> np.ndarray:
 def _sections(beam: Beam, patches: Patches, has_patches: bool) -> LinkSections:
     pieces = link_pieces(beam, patches._replace(center=jnp.asarray(patches.center)))
     bending = section_stiffness(beam, patches, pieces, has_patches)
-    covers = np.asarray(jnp.sum(pieces.has_sensor + pieces.has_actuator, axis=0))
+    covers = np.asarray(jnp.sum(pieces.has_ceramic + pieces.has_actuator, axis=0))
     covers = covers if has_patches else 0 * covers
     area, patch_area = beam.width * beam.thickness, patches.width * patches.thickness
     axial = beam.youngs_modulus * area + patches.youngs_modulus * patch_area * covers

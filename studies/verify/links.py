@@ -159,7 +159,8 @@ def _sections(beam: Beam, patches: Patches, has_patches: bool) -> list[Segment]:
             tuple(np.flatnonzero((ends[0] < middle) & (middle < ends[1])).tolist())
             for ends in (sensor, actuator)
         ]
-        count = len(over[0]), len(over[1])
+        ceramics = 0 if patches.is_gauge else len(over[0])
+        count = ceramics, len(over[1])
         bending = _stiffness(beam, patches, count if has_patches else (0, 0))
         line_mass = mass + ceramic * sum(count)
         found.append(
@@ -262,6 +263,9 @@ def _constants(beam: Beam, patches: Patches) -> tuple[float, float]:
     axis = skin * arm / (skin + core * float(beam.width) * thick)
     per_field = stiff * abs(float(patches.d31)) / piezo  # stress per volt [Pa/V]
     actuator = per_field * width * piezo * (arm - axis)
+    if patches.is_gauge:  # strain of the bare face, by a bridge and its amplifier
+        strain = (thick / 2 + axis) / float(patches.sensor_length)
+        return actuator, float(patches.bridge * patches.gauge_factor) * strain
     # under a sensor both faces are covered, so the neutral axis is the link's middle
     coupling = float(patches.d31) ** 2 * stiff
     permittivity = VACUUM_PERMITTIVITY * float(patches.relative_permittivity) - coupling

@@ -13,7 +13,7 @@ from jaxmodel.laws import LAWS
 from jaxmodel.linear import resting
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopMatrices, loop_matrices
-from studies.engine.controller import fixed_controller
+from studies.engine.controller import check_codable, fixed_controller
 from studies.engine.margins import judge_loops
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
@@ -145,6 +145,7 @@ def _exported(study: Study) -> Assumption:
     """C compiled on this machine, against the controller in JAX: hard inputs, and in the loop."""
     try:
         compiler = find_compiler()
+        check_codable(study)
         exported = fixed_controller(study)
     except StudyError as error:
         return _left_out(_NAMES[2], str(error))
