@@ -20,6 +20,7 @@ from jaxmodel.axial import axial_force, chord_slopes
 from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.controller import Controller
+from jaxmodel.delay import LONGEST, command_change, true_delay
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import drive_gains
 from jaxmodel.dynamics import mass_matrix, platform_mass
@@ -28,6 +29,7 @@ from jaxmodel.estimator import responses
 from jaxmodel.kinematics import close_chain
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import Loop
+from jaxmodel.notch import notch_response
 from jaxmodel.parameters import Array
 from jaxmodel.plant import Plant
 
@@ -59,6 +61,12 @@ class PlantResponse(NamedTuple):
     antialias: Array  # [rad/s], ()
     highpass: Array | None  # of the patches [rad/s], None if there is none, ()
     lag: Array | None  # of the amplifiers [s], None if there are none, ()
+    delay: Array | None  # from sample to command [samples], None: one, ()
+
+    @property
+    def late(self) -> Array:
+        """The same, also where it is one."""
+        return jnp.ones(()) if self.delay is None else self.delay
 
 
 def plant_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> PlantResponse:
@@ -144,6 +152,7 @@ def plant_response(structure: Structure, case: Case, loop: Loop, pose: Array) ->
         antialias=jnp.asarray(electronics.antialias),
         highpass=electronics.sensor_highpass if structure.has_sensor_highpass else None,
         lag=electronics.amplifier_lag if structure.has_amplifier else None,
+        delay=true_delay(electronics) if structure.has_delay else None,
     )
 
 
@@ -320,6 +329,8 @@ def controller_response(controller: Controller, z: Array) -> Array:
         z: e^(j omega T), ().
     """
     feedback, through = controller.feedback, controller.feedthrough
+    notch = controller.notch
+    passed = jnp.ones((3,)) if notch is None else notch_response(notch, z)
     if isinstance(feedback, Channels):
         rate, value = responses(feedback.estimator, z)
         force = feedback.velocity_gain * rate
@@ -332,6 +343,8 @@ def controller_response(controller: Controller, z: Array) -> Array:
         blocks = jnp.einsum("gmnb,gnbk->gmk", feedback.leave + 0j, state) + feedback.direct
         if len(blocks) == 1:
             through = _block_diagonal(through)[None]
+    of_sensors = jnp.reshape(jnp.repeat(passed, controller.feedthrough.shape[1]), (len(blocks), -1))
+    blocks = blocks * of_sensors[:, None]
     eye = np.eye(blocks.shape[-1])
     return _block_diagonal(jnp.linalg.solve(eye + blocks @ (through / z), blocks))
 
@@ -353,7 +366,7 @@ def response_of_loop(
 def command_gain(response: SampledLoopResponse, omega: Array, delay: Array | None = None) -> Array:
     """L(e^(j omega T)) = -K P where the commands are: I + L is the return difference, (3 K, 3 K).
 
-    P has the hold, one sample of computing delay, amplifier, links and pose, patches, anti-alias
+    P has the hold, computing delay, amplifier, links and pose, patches, anti-alias
     filter and sampler.
 
     Args:
@@ -362,8 +375,8 @@ def command_gain(response: SampledLoopResponse, omega: Array, delay: Array | Non
         delay: more delay [samples], (); None: none.
     """
     plant, order = response.plant, np.arange(-IMAGES, IMAGES + 1)
-    tau = jnp.zeros(()) if delay is None else delay
-    turned = image_weights(tau) * jnp.exp(-1j * omega * plant.period * (1 + tau))
+    late = plant.late if delay is None else plant.late + delay
+    turned = image_weights(late) * jnp.exp(-1j * omega * plant.period * late)
     sensed = jnp.einsum("n,nab->ab", turned, plant_images(plant, omega, order).sensed)
     return -controller_response(response.controller, jnp.exp(1j * omega * plant.period)) @ sensed
 
@@ -372,8 +385,9 @@ def command_gain_images(response: SampledLoopResponse, omega: Array) -> Array:
     """Parts of L by the first images, -`FEW`.. `FEW`; their sum lacks 1e-4, (I, 3 K, 3 K)."""
     plant, order = response.plant, np.arange(-FEW, FEW + 1)
     sensed = plant_images(plant, omega, order).sensed
-    late = jnp.exp(-1j * omega * plant.period)
-    return -controller_response(response.controller, 1 / late) @ sensed * late
+    turned = jnp.exp(-1j * (omega * plant.period + 2 * np.pi * order) * plant.late)
+    gain = controller_response(response.controller, jnp.exp(1j * omega * plant.period))
+    return -gain @ sensed * turned[:, None, None]
 
 
 class ClosedLoop(NamedTuple):
@@ -395,19 +409,32 @@ def close_loop(response: SampledLoopResponse, omega: Array, is_exact: bool = Tru
     plant = response.plant
     most = IMAGES if is_exact else FEW
     order = np.arange(-most, most + 1)
-    weights = image_weights(jnp.zeros(())) if is_exact else jnp.ones(order.shape)
-    images = jax.tree.map(
-        lambda x: jnp.einsum("n,nab->ab", weights + 0j, x), plant_images(plant, omega, order)
-    )
+    images = plant_images(plant, omega, order)
     z = jnp.exp(1j * omega * plant.period)
+
+    def sampled(parts: Array, delay: Array) -> Array:
+        turned = image_weights(delay) if is_exact else jnp.exp(-2j * np.pi * delay * order)
+        return jnp.einsum("n,nab->ab", turned * z**-delay, parts)
+
+    now, late = jnp.zeros(()), plant.late
     gain = controller_response(response.controller, z)
-    sensitivity = jnp.linalg.inv(np.eye(len(gain)) - gain @ images.sensed / z)
+    sensitivity = jnp.linalg.inv(np.eye(len(gain)) - gain @ sampled(images.sensed, late))
     effort = sensitivity @ gain
-    # modes that are left out bend at once with the voltage, held or lagging
-    follows = jnp.ones(())
-    if plant.lag is not None:
-        left = jnp.exp(-plant.period / jnp.maximum(plant.lag, plant.period / FASTEST))
-        follows = (1 - left) / (z - left)
-    bent = images.bent + follows * _block_diagonal(plant.direct_deflection)
-    deflection = images.pushed + bent @ effort @ images.disturbed / z
+    # modes that are left out bend at once with the voltage on the actuators
+    bent = sampled(images.bent, late) + _present(plant, z) * _block_diagonal(
+        plant.direct_deflection
+    )
+    deflection = sampled(images.pushed, now) + bent @ effort @ sampled(images.disturbed, now)
     return ClosedLoop(sensitivity, effort, deflection)
+
+
+def _present(plant: PlantResponse, z: Array) -> Array:
+    """Voltage on an actuator at a sampling instant per command [1], complex, ()."""
+    change = command_change(plant.late)
+    order = np.arange(LONGEST + 1)
+    before, after = (jnp.sum(x * z**-order) for x in (change.before, change.after))
+    if plant.lag is None:
+        return jnp.where(change.share > 0, before, after)
+    left = jnp.exp(-plant.period / jnp.maximum(plant.lag, plant.period / FASTEST))
+    kept = left ** (1 - change.share)  # of what the first command had reached
+    return ((kept - left) * before + (1 - kept) * after) / (z - left)

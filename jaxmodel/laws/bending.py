@@ -70,6 +70,8 @@ def bent(case: Case, model: LinkModel) -> BentModel:
         drive=jnp.pad(model.drive, more),
         sensor=jnp.pad(model.sensor, ((0, 0), (0, 0), (0, count))),
         energy=jnp.pad(model.energy, ((0, 0), (0, count))),
+        met=jnp.pad(model.met, ((0, 0), (0, count), (0, count))),
+        held=jnp.pad(model.held, more),
     )
     compliance = jnp.linalg.solve(jnp.eye(n) - model.state, model.drive)
     return BentModel(wide, compliance)

@@ -73,11 +73,11 @@ def design_blocks(exported: FixedController, signals: BlockSignals, dac_bits: in
     volts = blocks.of_groups(sensor_bound(exported.controller))  # (G, M)
     each = [responses(system, g, memory) for g in range(groups)]
     if system.anti_windup is None:
-        bound = [np.abs(x.state).sum(axis=3) @ v for x, v in zip(each, volts, strict=True)]
+        bounds = [np.abs(x.state).sum(axis=3) @ v for x, v in zip(each, volts, strict=True)]
     else:
         limit = float(exported.controller.voltage_limit)
-        bound = [_bound_observer(blocks, g, volts[g], limit) for g in range(groups)]
-    bound = np.stack(bound)
+        bounds = [_bound_observer(blocks, g, volts[g], limit) for g in range(groups)]
+    bound = np.stack(bounds)
     state = find_format(signals.state, np.maximum(bound, np.finfo(float).tiny))
     step, sensor = state.step, wires.sensor_step
     within = system.state * step[:, :, None, :] / step[..., None]
