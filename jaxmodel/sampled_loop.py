@@ -74,8 +74,8 @@ def loop_matrices(
     """`closed_loop` of a prepared case; moment None: at rest without load."""
     smooth = structure._replace(is_smooth=True, feedback="sampled")
     plant = linearise(smooth, loop, pose, moment)
-    analogue = _with_electronics(smooth, plant, case)
-    exact = _over_a_sample(analogue, case.electronics.period)
+    analogue = analogue_plant(smooth, plant, case)
+    exact = transition_over(analogue, case.electronics.period)
     from jax.flatten_util import ravel_pytree
 
     n, n_sensors = len(exact), 3 * structure.n_patches
@@ -134,10 +134,10 @@ def sampled_plant(structure: Structure, case: Case, pose: Array) -> SampledPlant
     """
     smooth = structure._replace(is_smooth=True, feedback="sampled")
     loop = prepare(smooth, case).loop
-    analogue = _with_electronics(
+    analogue = analogue_plant(
         smooth, linearise(smooth, loop, pose, resting(structure, case)), case
     )
-    exact = _over_a_sample(analogue, case.electronics.period)
+    exact = transition_over(analogue, case.electronics.period)
     n, n_sensors = len(exact), 3 * structure.n_patches
     eye = jnp.eye(n_sensors, dtype=exact.dtype)
     held = jnp.pad(exact[:, : n + n_sensors], ((0, n_sensors), (0, 0)))
@@ -148,7 +148,7 @@ def sampled_plant(structure: Structure, case: Case, pose: Array) -> SampledPlant
     )
 
 
-class _Analogue(NamedTuple):
+class AnaloguePlant(NamedTuple):
     """Plant and electronics between two samples."""
 
     state: Array  # A, (n, n)
@@ -158,18 +158,18 @@ class _Analogue(NamedTuple):
     size: Array  # typical size of each entry of the state, (n,)
 
 
-def _over_a_sample(analogue: _Analogue, period: Array) -> Array:
-    """Exact transition over a sample with held commands and forces, (n, n + 3 K + 3)."""
+def transition_over(analogue: AnaloguePlant, time: Array) -> Array:
+    """Exact transition over a time [s] with held commands and forces, (n, n + 3 K + 3)."""
     n, n_inputs = analogue.enters.shape
     held = jnp.zeros((n + n_inputs,) * 2, analogue.state.dtype)
     held = held.at[:n, :n].set(analogue.state).at[:n, n:].set(analogue.enters)
     # balance velocities against positions, or scaling costs the exponential digits
     scale = jnp.concatenate([analogue.size, jnp.full((n_inputs,), 1e6)])
-    exact = jax.scipy.linalg.expm(held / scale[:, None] * scale * period)
+    exact = jax.scipy.linalg.expm(held / scale[:, None] * scale * time)
     return (exact * scale[:, None] / scale)[:n]
 
 
-def _with_electronics(structure: Structure, plant: LinearPlant, case: Case) -> _Analogue:
+def analogue_plant(structure: Structure, plant: LinearPlant, case: Case) -> AnaloguePlant:
     """The plant with filters and, if present, drained patches and amplifiers.
 
     All filters are equal, so it does not matter whether modes are filtered before or after they
@@ -216,7 +216,7 @@ def _with_electronics(structure: Structure, plant: LinearPlant, case: Case) -> _
     forces = jnp.pad(plant.force, ((0, n - n_plant), (0, 0)))
     sizes += [(size, n_sensors) for size in blocks.values()]
     size = jnp.asarray(np.concatenate([np.full(count, x) for x, count in sizes]), state.dtype)
-    return _Analogue(
+    return AnaloguePlant(
         state=state,
         enters=jnp.concatenate([commands, forces], axis=1),
         filtered=at["z"],
