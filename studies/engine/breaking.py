@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -71,6 +71,7 @@ class BreakingChange(NamedTuple):
     change: Change  # NumPy arrays
     parts: tuple[Part, ...]  # by size, largest first
     breaking: str  # what goes unstable, see `name_motion`; "" if none was found
+    tolerances: Change  # one unit of each kind of change
 
     @property
     def text(self) -> str:
@@ -88,6 +89,16 @@ class BreakingChange(NamedTuple):
             f"the smallest change that breaks it, {self.distance:.3g} tolerances: {listed}"
             f"{others}; unstable is then {self.breaking}"
         )
+
+    def record(self) -> dict[str, Any]:
+        """For a JSON document."""
+        return {
+            "distance": self.distance,
+            "text": self.text,
+            "unstable": self.breaking,
+            "changes": [part._asdict() for part in self.parts],
+            "tolerances": self.tolerances._asdict(),
+        }
 
 
 def parse_tolerances(texts: Iterable[str]) -> Change:
@@ -146,10 +157,15 @@ def smallest_change(design: FixedController, tolerances: Change = TOLERANCES) ->
     distance, x, one = min(found, key=lambda entry: entry[0])
     if x is None:
         zero = one.unpack(np.zeros_like(unit))
-        return BreakingChange(distance, zero, parts=(), breaking="")
+        return BreakingChange(distance, zero, parts=(), breaking="", tolerances=tolerances)
     change = one.unpack(unit * x)
-    parts = _parts(change, one.unpack(x))
-    return BreakingChange(distance, change, parts, breaking=one.breaking(x))
+    return BreakingChange(
+        distance=distance,
+        change=change,
+        parts=_parts(change, one.unpack(x)),
+        breaking=one.breaking(x),
+        tolerances=tolerances,
+    )
 
 
 class _ChangedLoops:

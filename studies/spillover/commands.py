@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from studies.config import start
+from studies.sweeps.commands import Tolerance
 
 
 def add_commands(app: typer.Typer, console: Console) -> None:
@@ -28,6 +29,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         margin: Annotated[
             float, typer.Option(help="gain margin required on every plant [1]; 2 is 6 dB")
         ] = 2.0,
+        tolerance: Tolerance = None,
         pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
     ) -> None:
         """Certify a controller on plants that differ from its model."""
@@ -35,8 +37,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
         check_folder(out)
         start()
+        from studies.engine.breaking import parse_tolerances
         from studies.engine.design import load_design
         from studies.spillover.run import spillover_design
 
-        if not spillover_design(load_design(design, case), out, margin, console, pdf).is_passed:
+        tolerances = parse_tolerances(tolerance or [])
+        made = spillover_design(load_design(design, case), out, margin, console, pdf, tolerances)
+        if not made.is_passed:
             sys.exit(1)

@@ -9,7 +9,10 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from jaxmodel.changes import Change
 from jaxmodel.laws import LAWS
+from studies.engine.breaking import TOLERANCES, smallest_change
+from studies.engine.controller import fixed_controller
 from studies.engine.design import Design
 from studies.engine.progress import Phases
 from studies.engine.run_data import run_attributes
@@ -28,7 +31,7 @@ from studies.study.labels import STATUS_LABEL
 from studies.study.spec import Study
 
 DOCUMENT, DATA = "certificate.json", "spillover.h5"
-PHASES = ("judge", "compare laws", "draw")
+PHASES = ("judge", "smallest change", "compare laws", "draw")
 
 
 def spillover_design(
@@ -37,6 +40,7 @@ def spillover_design(
     margin: float = 2.0,
     console: Console | None = None,
     has_pdf: bool = False,
+    tolerances: Change = TOLERANCES,
 ) -> Certificate:
     """Write the certificate of a design, and the comparison of laws on its machine.
 
@@ -46,6 +50,7 @@ def spillover_design(
         margin: gain margin required on every plant [1].
         console: where messages go; default: standard output.
         has_pdf: also write the figures as PDF.
+        tolerances: units of the smallest change that breaks it, see `smallest_change`.
 
     Returns:
         the certificate; `is_passed`: whether the design passes.
@@ -63,6 +68,10 @@ def spillover_design(
         console.print(verdict(certificate), soft_wrap=True)
         for text in filter(None, (damping_text(certificate), spillover_text(certificate))):
             console.print(text, soft_wrap=True)
+        phases.begin("smallest change", "of the machine that breaks the design")
+        change = smallest_change(fixed_controller(certificate.study), tolerances)
+        certificate = certificate._replace(smallest_change=change)
+        console.print(change.text, soft_wrap=True)
         phases.begin("compare laws")
         laws = None
         try:
