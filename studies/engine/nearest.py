@@ -10,6 +10,8 @@ crossing, and the best ones then slide along the limit as long as they come near
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,12 +20,14 @@ from scipy.optimize import brentq
 
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 
-#: Motions tried, those of smallest distance by their first derivative, and steps with each.
-STARTS, STEPS = 10, 8
-#: A motion is given up when its distance is this many times the smallest one found [1].
-HOPELESS = 1.5
-#: Best points that slide along the limit, and steps of each.
-KEPT, SLIDES = 3, 10
+#: Motions that begin, those nearest to the limit, by steps so far from zero [tolerances].
+MOTIONS, BEGINNING, RADIUS = 20, 2, 4.0
+#: Motions that go on, and steps of each.
+STARTS, STEPS = 8, 6
+#: Steps along the limit of all that arrive; how many go on; their steps.
+FIRST, KEPT, SLIDES = 3, 2, 10
+#: Threads: JAX and LAPACK run beside each other.
+WORKERS = 2
 #: Longest step, as a share of the distance aimed at [1].
 STRIDE = 0.5
 #: Poles that decay to less than this over a sample cannot be the first to reach the circle [1].
@@ -80,17 +84,15 @@ def nearest_unstable(loops: Loops) -> np.ndarray | None:
     poles = _poles(loops.matrix(origin))
     if not poles or max(pole.growth for pole in poles) > 0:
         return origin
+    poles = sorted(poles, key=lambda pole: -pole.growth)[:MOTIONS]
     slopes = _first_slopes(loops, poles)
-    first = [
-        np.linalg.norm(_on_plane(pole.growth, slope, origin, loops))
-        for pole, slope in zip(poles, slopes, strict=True)
-    ]
-    unstable: list[np.ndarray] = []
-    for k in np.argsort(first)[:STARTS]:
-        least = min(map(np.linalg.norm, unstable), default=np.inf)
-        unstable += _descend(loops, poles[k], slopes[k], HOPELESS * float(least))
-    limit = [_back_to_limit(loops, x, 1) for x in _distinct(unstable)[: 2 * KEPT]]
-    ends = [_slide(loops, x) for x in _distinct(limit)[:KEPT]]
+    with ThreadPoolExecutor(WORKERS) as threads:
+        begun = list(filter(None, threads.map(partial(_begin, loops), poles, slopes)))
+        found = list(threads.map(partial(_descend, loops), _chosen(begun)))
+        unstable = _distinct([x for x in found if x is not None])
+        limit = list(threads.map(partial(_back_to_limit, loops, points=1), unstable))
+        limit = list(threads.map(partial(_slide, loops, steps=FIRST), limit))
+        ends = list(threads.map(partial(_slide, loops, steps=SLIDES), _distinct(limit)[:KEPT]))
     best = min(ends, key=np.linalg.norm, default=None)
     return None if best is None else _back_to_limit(loops, best, RAY)
 
@@ -151,20 +153,62 @@ def _on_plane(value: float, slope: np.ndarray, at: np.ndarray, loops: Loops) -> 
     return np.clip(high * direction, loops.lower, loops.upper)
 
 
-def _descend(loops: Loops, pole: _Pole, slope: np.ndarray, hopeless: float) -> list[np.ndarray]:
-    """The nearest unstable point on the way of one motion to its limit, or none.
+class _Start(NamedTuple):
+    """A point on the way of one motion to its limit."""
 
-    Args:
-        loops: the loop.
-        pole: the motion at zero.
-        slope: of its growth there, (p,).
-        hopeless: distance at which it is given up.
+    x: np.ndarray
+    pole: _Pole  # the motion, at x
+    slope: np.ndarray  # of its growth, (p,)
+    distance: float  # of the limit from zero by this slope [tolerances]
+
+
+def _begin(loops: Loops, pole: _Pole, slope: np.ndarray) -> _Start | None:
+    """Follow a motion over a few steps of fixed length from zero, on which its slope changes.
+
+    Poles that nearly coincide, as those of three equal links do, have slopes at zero that say
+    nothing of how far they get.
     """
-    x, found = np.zeros(len(loops.lower)), []
-    for k in range(STEPS):
+    x, aim = np.zeros(len(loops.lower)), np.zeros(0)
+    for _ in range(BEGINNING):
+        aim = _on_plane(pole.growth, slope, x, loops)
+        size = float(np.linalg.norm(aim))
+        if not np.isfinite(size) or size == 0:
+            return None
+        x = aim * min(RADIUS / size, _room(loops, aim))
+        poles = _poles(loops.matrix(x))
+        if not poles:
+            return None
+        pole = _next_pole(pole, poles)
+        slope = loops.slope(x, pole.weight)
+    distance = float(np.linalg.norm(_on_plane(pole.growth, slope, x, loops)))
+    return _Start(x, pole, slope, distance)
+
+
+def _chosen(begun: list[_Start]) -> list[_Start]:
+    """The most promising starts: half by their linear distance, half by how near to 1 |z| is.
+
+    Damping that shrinks by a factor never reaches zero, though its slope says where it would.
+    """
+    by_distance = sorted(begun, key=lambda one: one.distance)[: STARTS // 2]
+    rest = [one for one in begun if not any(one is other for other in by_distance)]
+    by_growth = sorted(rest, key=lambda one: -one.pole.growth)
+    return by_distance + by_growth[: STARTS - len(by_distance)]
+
+
+def _next_pole(pole: _Pole, poles: list[_Pole]) -> _Pole:
+    """The most unstable pole if there is one, else the one that continues a motion."""
+    worst = max(poles, key=lambda one: one.growth)
+    return worst if worst.growth > 0 else max(poles, key=lambda one: _likeness(pole, one))
+
+
+def _descend(loops: Loops, start: _Start) -> np.ndarray | None:
+    """The nearest unstable point on the way of one motion to its limit; None: there is none."""
+    x, pole, slope, _ = start
+    found = [x] if pole.growth > 0 else []
+    for _ in range(STEPS):
         aim = _on_plane(pole.growth, slope, x, loops)
         distance = float(np.linalg.norm(aim))
-        if not np.isfinite(distance) or (k > 1 and distance > hopeless):
+        if not np.isfinite(distance):
             break
         step = aim - x
         length = float(np.linalg.norm(step))
@@ -172,20 +216,17 @@ def _descend(loops: Loops, pole: _Pole, slope: np.ndarray, hopeless: float) -> l
         poles = _poles(loops.matrix(x))
         if not poles:
             break
-        worst = max(poles, key=lambda one: one.growth)
-        if worst.growth > 0:
+        pole = _next_pole(pole, poles)
+        if pole.growth > 0:
             found.append(x)
-            pole = worst
-        else:
-            pole = max(poles, key=lambda one: _likeness(pole, one))
-        if length < 0.02 * distance:
+        if length < 0.05 * distance:
             break
         slope = loops.slope(x, pole.weight)
-    if not found and np.any(x):
+    if not found:
         beyond = x * min(1.2, _room(loops, x))
         if growth(loops.matrix(beyond)) > 0:
             found.append(beyond)
-    return sorted(found, key=np.linalg.norm)[:1]
+    return min(found, key=np.linalg.norm, default=None)
 
 
 def _likeness(one: _Pole, other: _Pole) -> float:
@@ -224,9 +265,9 @@ def _distinct(points: list[np.ndarray]) -> list[np.ndarray]:
     return kept
 
 
-def _slide(loops: Loops, x: np.ndarray) -> np.ndarray:
+def _slide(loops: Loops, x: np.ndarray, steps: int) -> np.ndarray:
     """Along the limit of stability towards zero, from a point on it."""
-    for _ in range(SLIDES):
+    for _ in range(steps):
         pole = max(_poles(loops.matrix(x)), key=lambda one: one.growth)
         aim = _on_plane(pole.growth, loops.slope(x, pole.weight), x, loops)
         if not np.all(np.isfinite(aim)):
