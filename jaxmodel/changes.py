@@ -1,7 +1,7 @@
 """The sampled loop of a machine that has changed while its controller has not.
 
 Every physical number that drifts, is built with a tolerance, or is known badly is one entry of a
-`Change`; the transition matrix of the loop is a smooth function of all of them, so that its
+`MachineChange`; the transition matrix of the loop is a smooth function of all of them, so that its
 exact derivative by any of them is at hand (docs/theory.md, "The smallest change that breaks a
 design").
 """
@@ -22,7 +22,7 @@ from jaxmodel.sampled_loop import analogue_plant, transition_over
 LONGEST_DELAY = 2.0
 
 
-class Change(NamedTuple):
+class MachineChange(NamedTuple):
     """Departure of a machine from its nominal numbers; all zero: none.
 
     Relative changes are natural logarithms of the factor, so that no factor becomes negative.
@@ -38,7 +38,7 @@ class Change(NamedTuple):
     joint_inertia: Array  # added at the platform joint of each link [kg m2], (3,)
 
 
-def changed_case(case: Case, change: Change) -> Case:
+def changed_case(case: Case, change: MachineChange) -> Case:
     """The case of the changed machine; channel gains and delay are not part of a case.
 
     Args:
@@ -61,7 +61,7 @@ def changed_case(case: Case, change: Change) -> Case:
 
 
 def changed_loop(
-    structure: Structure, case: Case, pose: Array, law: Controller, change: Change
+    structure: Structure, case: Case, pose: Array, law: Controller, change: MachineChange
 ) -> tuple[Array, Array]:
     """One sample of a changed machine under a given controller; differentiable by the change.
 

@@ -134,9 +134,7 @@ def sampled_plant(structure: Structure, case: Case, pose: Array) -> SampledPlant
     """
     smooth = structure._replace(is_smooth=True, feedback="sampled")
     loop = prepare(smooth, case).loop
-    analogue = analogue_plant(
-        smooth, linearise(smooth, loop, pose, resting(structure, case)), case
-    )
+    analogue = analogue_plant(smooth, linearise(smooth, loop, pose, resting(structure, case)), case)
     exact = transition_over(analogue, case.electronics.period)
     n, n_sensors = len(exact), 3 * structure.n_patches
     eye = jnp.eye(n_sensors, dtype=exact.dtype)

@@ -6,7 +6,7 @@ import pytest
 from scipy.linalg import eig, expm
 from threadpoolctl import threadpool_limits
 
-from jaxmodel.changes import Change, changed_case
+from jaxmodel.changes import MachineChange, changed_case
 from jaxmodel.linear import linearise, resting
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import analogue_plant, closed_loop
@@ -25,7 +25,7 @@ STUDY = paper_study().change(link__modes=3)
 
 def rest(n_patches=3):
     patches = np.zeros((3, n_patches))
-    return Change(
+    return MachineChange(
         stiffness=np.zeros(3),
         damping=np.zeros(3),
         payload=np.zeros(()),
@@ -266,13 +266,13 @@ def test_tolerances_are_numbers_by_name():
     with pytest.raises(StudyError, match="--tolerance payload = '-1'; allowed: .* from 0 .kg."):
         parse_tolerances(["payload=-1"])
     with pytest.raises(StudyError, match="at least one number"):
-        parse_tolerances([f"{name}=0" for name in Change._fields])
+        parse_tolerances([f"{name}=0" for name in MachineChange._fields])
 
 
 def test_what_does_not_change_stays(design, found):
     """Without the kind that matters most, the distance grows and that kind is zero."""
     kind = max(
-        Change._fields,
+        MachineChange._fields,
         key=lambda name: np.abs(getattr(found.change, name)).sum() / getattr(TOLERANCES, name),
     )
     other = smallest_change(design.fixed, TOLERANCES._replace(**{kind: 0.0}))

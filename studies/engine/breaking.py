@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from jaxmodel.beam import BASES
 from jaxmodel.case import Case, Structure
-from jaxmodel.changes import LONGEST_DELAY, Change, changed_loop
+from jaxmodel.changes import LONGEST_DELAY, MachineChange, changed_loop
 from jaxmodel.controller import Controller, linear_parts
 from jaxmodel.parameters import Array
 from studies.engine.controller import FixedController
@@ -24,8 +24,8 @@ from studies.engine.stability import with_margin_modes
 from studies.errors import StudyError, field_error, nearest
 
 #: One unit of each kind of change: how far it may well be off on a machine as built, in the units
-#: of `Change`; of relative changes the natural logarithm of the factor.
-TOLERANCES = Change(
+#: of `MachineChange`; of relative changes the natural logarithm of the factor.
+TOLERANCES = MachineChange(
     stiffness=0.05,  # thickness within 1.7 %
     damping=0.2,  # seldom known better
     payload=0.02,  # [kg]
@@ -36,7 +36,7 @@ TOLERANCES = Change(
     joint_inertia=1e-6,  # [kg m2]
 )
 #: Units of them.
-UNITS = Change(
+UNITS = MachineChange(
     stiffness="1",
     damping="1",
     payload="kg",
@@ -56,7 +56,7 @@ NAMED, LONGEST = 0.9, 5
 SMALL = 0.1
 
 
-class Part(NamedTuple):
+class ChangedNumber(NamedTuple):
     """One number of a changed machine."""
 
     name: str  # such as "patch 2 of link 1"
@@ -68,10 +68,10 @@ class BreakingChange(NamedTuple):
     """The nearest machine with which a design's controller is unstable."""
 
     distance: float  # Euclidean [tolerances]; 0: unstable as it is, inf: none was found
-    change: Change  # NumPy arrays
-    parts: tuple[Part, ...]  # by size, largest first
+    change: MachineChange  # NumPy arrays
+    parts: tuple[ChangedNumber, ...]  # by size, largest first
     breaking: str  # what goes unstable, see `name_motion`; "" if none was found
-    tolerances: Change  # one unit of each kind of change
+    tolerances: MachineChange  # one unit of each kind of change
 
     @property
     def text(self) -> str:
@@ -101,7 +101,7 @@ class BreakingChange(NamedTuple):
         }
 
 
-def parse_tolerances(texts: Iterable[str]) -> Change:
+def parse_tolerances(texts: Iterable[str]) -> MachineChange:
     """`TOLERANCES` with others from texts NAME=VALUE; 0: this number does not change.
 
     Raises:
@@ -110,9 +110,11 @@ def parse_tolerances(texts: Iterable[str]) -> Change:
     tolerances = TOLERANCES
     for text in texts:
         name, _, value = (part.strip() for part in text.partition("="))
-        if name not in Change._fields:
-            allowed = f"{', '.join(Change._fields)}, each as NAME=VALUE"
-            raise field_error("--tolerance", name, allowed, hint=nearest(name, Change._fields))
+        if name not in MachineChange._fields:
+            allowed = f"{', '.join(MachineChange._fields)}, each as NAME=VALUE"
+            raise field_error(
+                "--tolerance", name, allowed, hint=nearest(name, MachineChange._fields)
+            )
         try:
             number = float(value)
         except ValueError:
@@ -126,7 +128,9 @@ def parse_tolerances(texts: Iterable[str]) -> Change:
     return tolerances
 
 
-def smallest_change(design: FixedController, tolerances: Change = TOLERANCES) -> BreakingChange:
+def smallest_change(
+    design: FixedController, tolerances: MachineChange = TOLERANCES
+) -> BreakingChange:
     """The smallest change of a design's machine with which its controller is unstable.
 
     The norm is Euclidean, each number in units of its tolerance; the controller stays as designed
@@ -175,14 +179,14 @@ class _ChangedLoops:
         self, structure: Structure, case: Case, pose: np.ndarray, law: Controller, unit: np.ndarray
     ) -> None:
         self._case, self._unit = case, unit
-        shape = Change(*(np.zeros(x) for x in _shapes(structure)))
+        shape = MachineChange(*(np.zeros(x) for x in _shapes(structure)))
         self._unravel = ravel_pytree(shape)[1]
         self._fixed = structure, case, pose, law
         if not np.all(np.isfinite(self.matrix(np.zeros_like(unit)))):
             raise StudyError("the linearised loop is not finite: nothing to judge")
 
-    def unpack(self, x: np.ndarray) -> Change:
-        change: Change = jax.tree.map(np.asarray, self._unravel(jnp.asarray(x)))
+    def unpack(self, x: np.ndarray) -> MachineChange:
+        change: MachineChange = jax.tree.map(np.asarray, self._unravel(jnp.asarray(x)))
         return change
 
     def matrix(self, x: np.ndarray) -> np.ndarray:
@@ -208,27 +212,32 @@ class _ChangedLoops:
 
 @kept_jit(static_argnums=0)
 def _transition(
-    structure: Structure, case: Case, pose: Array, law: Controller, change: Change
+    structure: Structure, case: Case, pose: Array, law: Controller, change: MachineChange
 ) -> tuple[Array, Array]:
     return changed_loop(structure, case, pose, law, change)
 
 
 @kept_jit(static_argnums=0)
 def _pull(
-    structure: Structure, case: Case, pose: Array, law: Controller, change: Change, weight: Array
-) -> Change:
+    structure: Structure,
+    case: Case,
+    pose: Array,
+    law: Controller,
+    change: MachineChange,
+    weight: Array,
+) -> MachineChange:
     """Derivative of sum(weight * matrix) by the change."""
 
-    def weighed(change: Change) -> Array:
+    def weighed(change: MachineChange) -> Array:
         return jnp.sum(weight * changed_loop(structure, case, pose, law, change)[0])
 
     return jax.grad(weighed)(change)
 
 
-def _shapes(structure: Structure) -> Change:
+def _shapes(structure: Structure) -> MachineChange:
     """Of the fields of a change."""
     patches = (3, structure.n_patches)
-    return Change(
+    return MachineChange(
         stiffness=(3,),
         damping=(3,),
         payload=(),
@@ -240,14 +249,16 @@ def _shapes(structure: Structure) -> Change:
     )
 
 
-def _limits(structure: Structure, case: Case, unit: Change) -> tuple[Change, Change, Change]:
+def _limits(
+    structure: Structure, case: Case, unit: MachineChange
+) -> tuple[MachineChange, MachineChange, MachineChange]:
     """Units of all entries, and their smallest and largest values in them."""
     machine = case.machine
     mass = float(machine.masses.platform_mass + np.asarray(machine.masses.payload_mass))
     towards_b, towards_c = _free_way(case)
     inertia = np.broadcast_to(machine.beam.joint_inertia_c, (3,))
     heaviest = np.inf if BASES[structure.basis].has_joints else 0.0
-    ends = Change(
+    ends = MachineChange(
         stiffness=(-MOST, MOST),
         damping=(-MOST, MOST),
         payload=(-LIGHTER * mass, np.inf),
@@ -261,15 +272,15 @@ def _limits(structure: Structure, case: Case, unit: Change) -> tuple[Change, Cha
     def spread(x: Array, shape: tuple[int, ...]) -> np.ndarray:
         return np.array(np.broadcast_to(np.asarray(x, float), shape))
 
-    def in_units(k: int) -> Change:
-        return Change(
+    def in_units(k: int) -> MachineChange:
+        return MachineChange(
             *(
                 spread(end[k] / one, shape) if one > 0 else np.zeros(shape)
                 for end, one, shape in zip(ends, unit, _shapes(structure), strict=True)
             )
         )
 
-    units = Change(*map(spread, unit, _shapes(structure)))
+    units = MachineChange(*map(spread, unit, _shapes(structure)))
     return units, in_units(0), in_units(1)
 
 
@@ -294,14 +305,14 @@ def _free_way(case: Case) -> tuple[np.ndarray, np.ndarray]:
     return ways[0], ways[1]
 
 
-def _parts(change: Change, size: Change) -> tuple[Part, ...]:
+def _parts(change: MachineChange, size: MachineChange) -> tuple[ChangedNumber, ...]:
     """The numbers that change, with the largest first."""
     parts = []
-    for name, value, own in zip(Change._fields, change, size, strict=True):
+    for name, value, own in zip(MachineChange._fields, change, size, strict=True):
         for at in np.ndindex(value.shape):
             if abs(own[at]) >= SMALL:
                 what, how = _words(name, at, float(value[at]))
-                parts.append(Part(what, f"{what} {how}".strip(), float(own[at])))
+                parts.append(ChangedNumber(what, f"{what} {how}".strip(), float(own[at])))
     return tuple(sorted(parts, key=lambda part: -abs(part.size)))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from jaxmodel.changes import Change
+from jaxmodel.changes import MachineChange
 from jaxmodel.laws import LAWS
 from studies.engine.breaking import TOLERANCES, smallest_change
 from studies.engine.controller import fixed_controller
@@ -40,7 +40,7 @@ def spillover_design(
     margin: float = 2.0,
     console: Console | None = None,
     has_pdf: bool = False,
-    tolerances: Change = TOLERANCES,
+    tolerances: MachineChange = TOLERANCES,
 ) -> Certificate:
     """Write the certificate of a design, and the comparison of laws on its machine.
 

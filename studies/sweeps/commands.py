@@ -172,7 +172,6 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if breaks:
             start()
         from studies.engine.results import direction, read_sweep
-        from studies.sweeps.breaking import breaking_changes
         from studies.sweeps.show import (
             counted_text,
             print_cases,
@@ -187,6 +186,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
             document = best_document(data, by, subject_to, count)
             if breaks:
+                from studies.sweeps.breaking import breaking_changes
+
                 numbers = [case["case"] for case in document["cases"]]
                 document["smallest_changes"] = [
                     entry.record() for entry in breaking_changes(folder, numbers, tolerance or [])
@@ -199,6 +200,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         print_cases(data, cases, [name], console)
         print_left_out(data, console)
         if breaks:
+            from studies.sweeps.breaking import breaking_changes
+
             for entry in breaking_changes(folder, cases.tolist(), tolerance or []):
                 console.print(f"case {entry.case}: {entry.text}", soft_wrap=True)
 
