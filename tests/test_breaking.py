@@ -1,5 +1,6 @@
 """The smallest change that breaks a design: the changed loop, its slopes, the search, the words."""
 
+import jax
 import jsonschema
 import numpy as np
 import pytest
@@ -14,13 +15,15 @@ from studies.engine import breaking
 from studies.engine.breaking import TOLERANCES, parse_tolerances, smallest_change
 from studies.engine.controller import fixed_controller
 from studies.engine.nearest import Loops, growth, nearest_unstable
-from studies.engine.stability import with_margin_modes
 from studies.errors import StudyError
 from studies.show.document import plain, schema
 from studies.study.spec import paper_study
 from tests.evolution import cma_es
 
 STUDY = paper_study().change(link__modes=3)
+
+
+evaluated = jax.jit(closed_loop, static_argnums=0)
 
 
 def rest(n_patches=3):
@@ -42,7 +45,7 @@ class Design:
 
     def __init__(self, study):
         self.fixed = fixed_controller(study)
-        self.structure, self.case = with_margin_modes(self.fixed.structure, self.fixed.case)
+        self.structure, self.case = breaking._machine(self.fixed)
         self.pose = np.array(study.motion.waypoints[0], float)
         self.unit, self.lower, self.upper = (
             np.concatenate([np.ravel(x) for x in part])
@@ -79,7 +82,7 @@ def poles(matrix, count=40):
 
 
 def test_without_change_the_loop_is_the_design_s(design):
-    loop = closed_loop(design.structure, design.case, design.pose, design.fixed.controller)
+    loop = evaluated(design.structure, design.case, design.pose, design.fixed.controller)
     wanted = np.asarray(loop.open + loop.feedback)
     np.testing.assert_allclose(poles(design.transition(rest())), poles(wanted), rtol=1e-9)
 
@@ -94,7 +97,7 @@ def test_a_changed_machine_is_that_of_its_case(design):
         patch=rng.normal(0, 1e-3, (3, 3)),
     )
     case = changed_case(design.case, change)
-    loop = closed_loop(design.structure, case, design.pose, design.fixed.controller)
+    loop = evaluated(design.structure, case, design.pose, design.fixed.controller)
     wanted = np.asarray(loop.open + loop.feedback)
     np.testing.assert_allclose(poles(design.transition(change)), poles(wanted), rtol=1e-9)
     beam = case.machine.beam
@@ -105,11 +108,11 @@ def test_gains_of_channels_are_gains_of_the_controller(design):
     """All actuators and sensors together are a factor on all gains where nothing is fed through."""
     study = STUDY.change(control__feedthrough_factor=0.0)
     fixed = fixed_controller(study)
-    structure, case = with_margin_modes(fixed.structure, fixed.case)
+    structure, case = breaking._machine(fixed)
     ones = np.ones((3, 3))
     change = rest()._replace(actuator=np.log(1.3) * ones, sensor=np.log(1.1) * ones)
     matrix = breaking._transition(structure, case, design.pose, fixed.controller, change)[0]
-    loop = closed_loop(structure, case, design.pose, fixed.controller)
+    loop = evaluated(structure, case, design.pose, fixed.controller)
     wanted = np.asarray(loop.open + 1.43 * loop.feedback)
     np.testing.assert_allclose(poles(np.asarray(matrix)), poles(wanted), rtol=1e-8)
 

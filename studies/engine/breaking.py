@@ -15,6 +15,7 @@ from jaxmodel.beam import BASES
 from jaxmodel.case import Case, Structure
 from jaxmodel.changes import LONGEST_DELAY, MachineChange, changed_loop
 from jaxmodel.controller import Controller, linear_parts
+from jaxmodel.laws.srf import SRF
 from jaxmodel.parameters import Array
 from studies.engine.controller import FixedController
 from studies.engine.host_loop import SampledLoop, name_motion
@@ -145,7 +146,7 @@ def smallest_change(
     Raises:
         StudyError: the loop is not finite.
     """
-    structure, case = with_margin_modes(design.structure, design.case)
+    structure, case = _machine(design)
     pose = np.array(design.study.motion.waypoints[0], float)
     unit, lower, upper = (
         np.asarray(ravel_pytree(x)[0]) for x in _limits(structure, case, tolerances)
@@ -170,6 +171,12 @@ def smallest_change(
         breaking=one.breaking(x),
         tolerances=tolerances,
     )
+
+
+def _machine(design: FixedController) -> tuple[Structure, Case]:
+    """The design's machine, without what only the design of its controller depends on."""
+    structure, case = with_margin_modes(design.structure, design.case)
+    return structure._replace(law=SRF.name, has_poles=False), case
 
 
 class _ChangedLoops:
