@@ -117,15 +117,24 @@ def test_gains_of_channels_are_gains_of_the_controller(design):
     np.testing.assert_allclose(poles(np.asarray(matrix)), poles(wanted), rtol=1e-8)
 
 
+def analogue_of(design):
+    smooth = design.structure._replace(is_smooth=True)
+
+    def evaluate(case):
+        loop = prepare(smooth, case).loop
+        plant = linearise(smooth, loop, design.pose, resting(smooth, case))
+        whole = analogue_plant(smooth, plant, case)
+        return whole.state, whole.enters, whole.size
+
+    return jax.jit(evaluate)(design.case)
+
+
 @pytest.mark.parametrize("delay", [0.3, 1.0, 1.6])
 def test_a_delay_is_a_later_edge_of_the_hold(design, delay):
     """Beside a simulation: the plant over parts of a sample by SciPy, commands one by one."""
-    smooth = design.structure._replace(is_smooth=True)
-    loop = prepare(smooth, design.case).loop
-    plant = linearise(smooth, loop, design.pose, resting(smooth, design.case))
-    analogue = analogue_plant(smooth, plant, design.case)
-    a, b = np.asarray(analogue.state), np.asarray(analogue.enters)[:, :9]
-    n, size = len(a), np.concatenate([np.asarray(analogue.size), np.full(9, 1e6)])
+    analogue = analogue_of(design)
+    a, b = np.asarray(analogue[0]), np.asarray(analogue[1])[:, :9]
+    n, size = len(a), np.concatenate([np.asarray(analogue[2]), np.full(9, 1e6)])
     held = np.zeros((n + 9, n + 9))
     held[:n, :n], held[:n, n:] = a, b
     period = float(design.case.electronics.period)
