@@ -317,12 +317,15 @@ def random_study(rng):
 
 
 def check_against_references(seed, n_samples, n_steps):
-    """Random changes at the distance over 1.05, and CMA-ES from zero: ratio of the distances."""
+    """Random changes at the distance over 1.05, and CMA-ES from zero: ratio of the distances.
+
+    NaN if there is nothing to compare.
+    """
     rng = np.random.default_rng(seed)
     design = Design(random_study(rng))
     x = nearest_unstable(design.loops)
-    if not np.any(x):
-        return 1.0
+    if not np.any(x):  # unstable as it is
+        return np.nan
     distance = float(np.linalg.norm(x))
     with threadpool_limits(1, "blas"):
         for point in shell(design, distance / 1.05, n_samples, rng):
@@ -337,8 +340,8 @@ def check_against_references(seed, n_samples, n_steps):
 
         other = cma_es(cost, 0 * x, distance / 5, n_steps, seed)
         other = np.clip(other, design.lower, design.upper)
-        if growth(design.changed.matrix(other)) < -1e-4:  # not arrived
-            return 1.0
+        if growth(design.changed.matrix(other)) < -1e-4:  # it has not arrived
+            return np.nan
     return distance / float(np.linalg.norm(other))
 
 
@@ -347,4 +350,4 @@ def check_against_references(seed, n_samples, n_steps):
 def test_smallest_changes_of_random_designs_beside_cma_es():
     """50 designs: no worse than 1.05 times what samples and CMA-ES find."""
     ratios = [check_against_references(seed, 2000, 4000) for seed in range(50)]
-    assert max(ratios) <= 1.05, ratios
+    assert np.isfinite(ratios).sum() >= 30 and np.nanmax(ratios) <= 1.05, ratios
