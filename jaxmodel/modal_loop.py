@@ -121,14 +121,17 @@ def _linear_law(law: Controller) -> tuple[Array, Array, Array, Array]:
     """A, B, C, D of a controller, see `ModalLoop`."""
     from jax.flatten_util import ravel_pytree
 
-    rest, unpack = ravel_pytree(rest_controller(law).feedback)
-    applied = jnp.zeros(rest_controller(law).voltage.shape)
+    start = rest_controller(law)
+    rest, unpack = ravel_pytree((start.feedback, start.notch))
+    applied = jnp.zeros(start.voltage.shape)
     width = applied.size
 
     def step(x: Array, ports: Array) -> tuple[Array, Array]:
         measured, held = (jnp.reshape(part, applied.shape) for part in jnp.split(ports, 2))
-        after, info = controller_step(law, ControllerState(unpack(x), held), measured, None, True)
-        return ravel_pytree(after.feedback)[0], jnp.ravel(info.command)
+        feedback, notch = unpack(x)
+        before = ControllerState(feedback, held, notch)
+        after, info = controller_step(law, before, measured, None, True)
+        return ravel_pytree((after.feedback, after.notch))[0], jnp.ravel(info.command)
 
     (a, b), (c, d) = jax.jacfwd(step, (0, 1))(jnp.zeros_like(rest), jnp.zeros(2 * width))
     return a, b, c, d

@@ -83,7 +83,7 @@ def loop_matrices(
     smooth = structure._replace(is_smooth=True, feedback="sampled")
     drive = DRIVES[structure.drive]
     plant = linearise(smooth, loop, pose, moment, drive.is_sampled)
-    analogue = _with_electronics(smooth, plant, case)
+    analogue = analogue_plant(smooth, plant, case)
     exact = _over_a_sample(smooth, analogue, case)
     from jax.flatten_util import ravel_pytree
 
@@ -204,7 +204,7 @@ def sampled_plant(structure: Structure, case: Case, pose: Array) -> SampledPlant
     smooth = structure._replace(is_smooth=True, feedback="sampled")
     loop, drive = prepare(smooth, case).loop, DRIVES[structure.drive]
     plant = linearise(smooth, loop, pose, resting(structure, case), drive.is_sampled)
-    analogue = _with_electronics(smooth, plant, case)
+    analogue = analogue_plant(smooth, plant, case)
     exact = _over_a_sample(smooth, analogue, case)
     from jax.flatten_util import ravel_pytree
 
@@ -229,7 +229,7 @@ def sampled_plant(structure: Structure, case: Case, pose: Array) -> SampledPlant
     )
 
 
-class _Analogue(NamedTuple):
+class AnaloguePlant(NamedTuple):
     """Plant and electronics between two samples."""
 
     state: Array  # A, (n, n)
@@ -248,7 +248,7 @@ class _Sampled(NamedTuple):
     present: Array  # command on the actuators, of state and u_(k-1), (3 K, n + 3 K)
 
 
-def _over_a_sample(structure: Structure, analogue: _Analogue, case: Case) -> _Sampled:
+def _over_a_sample(structure: Structure, analogue: AnaloguePlant, case: Case) -> _Sampled:
     """Transition of plant and electronics from sample to sample."""
     period, n_sensors = case.electronics.period, 3 * structure.n_patches
     eye = jnp.eye(n_sensors, dtype=analogue.state.dtype)
@@ -283,7 +283,7 @@ def _over_a_sample(structure: Structure, analogue: _Analogue, case: Case) -> _Sa
     )
 
 
-def _held_transition(analogue: _Analogue, period: Array) -> Array:
+def _held_transition(analogue: AnaloguePlant, period: Array) -> Array:
     """Exact transition over a time with held commands and forces, (n, n + 3 K + 3)."""
     n, n_inputs = analogue.enters.shape
     held = jnp.zeros((n + n_inputs,) * 2, analogue.state.dtype)
@@ -294,7 +294,7 @@ def _held_transition(analogue: _Analogue, period: Array) -> Array:
     return (exact * scale[:, None] / scale)[:n]
 
 
-def _with_electronics(structure: Structure, plant: LinearPlant, case: Case) -> _Analogue:
+def analogue_plant(structure: Structure, plant: LinearPlant, case: Case) -> AnaloguePlant:
     """The plant with filters and, if present, drained patches and amplifiers.
 
     All filters are equal, so it does not matter whether modes are filtered before or after they
@@ -341,7 +341,7 @@ def _with_electronics(structure: Structure, plant: LinearPlant, case: Case) -> _
     forces = jnp.pad(plant.force, ((0, n - n_plant), (0, 0)))
     sizes += [(size, n_sensors) for size in blocks.values()]
     size = jnp.asarray(np.concatenate([np.full(count, x) for x, count in sizes]), state.dtype)
-    return _Analogue(
+    return AnaloguePlant(
         state=state,
         enters=jnp.concatenate([commands, forces], axis=1),
         filtered=at["z"],

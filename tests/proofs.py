@@ -99,7 +99,7 @@ def many_modes_loop(design, n_modes):
 def _analogue(structure, case, pose):
     loop = prepare(structure, case).loop
     plant = linearise(structure, loop, pose, resting(structure, case))
-    whole = sampled_loop._with_electronics(structure, plant, case)
+    whole = sampled_loop.analogue_plant(structure, plant, case)
     inputs = whole.enters.shape[1] - 3
     filtered = jnp.arange(whole.state.shape[0])[whole.filtered]
     return whole.state, whole.enters[:, :inputs], filtered, loop.omega

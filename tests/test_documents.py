@@ -14,7 +14,10 @@ import typer
 from jaxmodel import status
 from studies.cli import app
 from studies.engine import results
+from studies.engine.breaking import TOLERANCES, BreakingChange, ChangedNumber
+from studies.engine.design import Design
 from studies.engine.runs import uncontrolled_twin
+from studies.errors import StudyError
 from studies.show.document import documented, json_text, schema
 from studies.single.run import simulate
 from studies.sweeps.sensitivity import analyse
@@ -96,6 +99,39 @@ def test_best(document):
     assert found["direction"] == "smallest" and found["without_control"] is None
     assert [x["status_text"] for x in found["left_out"]] == [status.REASONS[4]]
     assert len(found["warnings"]) == 1 and "gain margin below 2" in found["warnings"][0]
+
+
+def test_best_with_what_breaks_each(capsys, document, monkeypatch):
+    from studies.sweeps import breaking
+
+    units = TOLERANCES._replace(patch=0.0)
+    change = BreakingChange(
+        distance=2.0,
+        change=None,
+        parts=(ChangedNumber("delay", "delay 0.5 samples late", 2.0),),
+        breaking="mode 3 of link 1 (958 Hz)",
+        tolerances=units,
+    )
+    monkeypatch.setattr(breaking, "load_design", lambda folder, case: Design(case, {}))
+
+    def fixed(study):
+        if study == 4:
+            raise StudyError("no link is controlled")
+        return study
+
+    monkeypatch.setattr(breaking, "fixed_controller", fixed)
+    monkeypatch.setattr(breaking, "smallest_change", lambda design, tolerances: change)
+    wanted = ("best", "DIR", "--by", "residual_rms", "--count", 3, "--breaks")
+    wanted += ("--tolerance", "patch=0")
+    found = document(*wanted, data=usual(codes=[0, 0, 0, 0, 0, 0, 0, 4]))["smallest_changes"]
+    by_case = {entry["case"]: entry for entry in found}
+    assert len(found) == 3 and by_case[4]["fault"] == "not judged: no link is controlled"
+    other = next(entry for entry in found if entry["case"] != 4)
+    assert other["smallest_change"]["tolerances"]["patch"] == 0 and other["fault"] == ""
+    text = run(capsys, *wanted)[1]
+    assert f"case {other['case']}: {change.text}" in text and "case 4: not judged" in text
+    said = refused(capsys, "best", "DIR", "--by", "residual_rms", "--tolerance", "patch=0")
+    assert "--tolerance: for --breaks only" in said
 
 
 def test_show(document):

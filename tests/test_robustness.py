@@ -24,7 +24,7 @@ from jaxmodel.robustness import (
     robustness_figures,
     search_frequencies,
 )
-from jaxmodel.sampled_loop import _with_electronics, closed_loop
+from jaxmodel.sampled_loop import analogue_plant, closed_loop
 from jaxmodel.scaling import best_scaling, scaled
 from studies.engine.margins import judge_loops
 from studies.engine.results import read_sweep
@@ -159,21 +159,21 @@ def analogue_of(loop: Loop) -> Any:
 
     def matrices(case):
         plant = linearise(smooth, prepare(smooth, case).loop, POSE, resting(smooth, case))
-        found = _with_electronics(smooth, plant, case)
+        found = analogue_plant(smooth, plant, case)
         return found.state, found.enters
 
     if id(loop.matrices) not in _ANALOGUES:
         state, enters = map(np.asarray, jax.jit(matrices)(loop.case))
-        _ANALOGUES[id(loop.matrices)] = _Analogue(state, enters)
+        _ANALOGUES[id(loop.matrices)] = AnaloguePlant(state, enters)
     return _ANALOGUES[id(loop.matrices)]
 
 
-class _Analogue(NamedTuple):
+class AnaloguePlant(NamedTuple):
     state: np.ndarray
     enters: np.ndarray
 
 
-_ANALOGUES: dict[int, _Analogue] = {}
+_ANALOGUES: dict[int, AnaloguePlant] = {}
 
 #: Laws with gain factors at which their loops are stable.
 LOOPS = {"imsc": 0.5, "lqr": 0.5, "srf": 2e-4, "ppf": 0.5, "observer": 0.5, "lqg": 0.5}

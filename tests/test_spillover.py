@@ -21,6 +21,7 @@ from jaxmodel.controller import (
 from jaxmodel.electronics import measurement_chain
 from jaxmodel.laws.lqr import optimal_gains
 from jaxmodel.laws.ppf import HIGHEST_RATIO, design_position_filter
+from studies.engine.breaking import TOLERANCES, BreakingChange, ChangedNumber
 from studies.engine.controller import fixed_controller
 from studies.engine.runs import run_study
 from studies.engine.stability import follow_modes, loop_report, modal_damping
@@ -455,8 +456,24 @@ def test_damping_is_that_of_links_that_control_the_mode():
     assert view.margin(0.0) == HIGHEST
 
 
+#: As if it were found; `tests/test_breaking.py` looks for real ones.
+CHANGE = BreakingChange(
+    distance=2.5,
+    change=None,
+    parts=(
+        ChangedNumber("delay", "delay 0.5 samples late", 2.0),
+        ChangedNumber("E of link 1", "E of link 1 -7.2 %", -1.5),
+    ),
+    breaking="mode 3 of link 1 (958 Hz)",
+    tolerances=TOLERANCES,
+)
+
+
 def few(monkeypatch, comparison):
-    """A command that looks at few plants."""
+    """A command that looks at few plants, and for no change."""
+    monkeypatch.setattr(
+        spillover_run, "smallest_change", lambda design, units: CHANGE._replace(tolerances=units)
+    )
     chosen = {"bases": ("pinned_pinned",), "mismatches": patch_lengths((0.8, 1.0)), "sizes": (3, 9)}
     monkeypatch.setattr(spillover_run, "certify", partial(certify, **chosen))
     monkeypatch.setattr(spillover_run, "compare_laws", comparison)
@@ -471,8 +488,11 @@ def write(folder, **changes):
 def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_path, comparison):
     few(monkeypatch, lambda study, margin: comparison)
     design, out = write(tmp_path), tmp_path / "deep" / "out"
-    code, text, _ = run(capsys, "spillover", design, "--out", out, "--pdf")
+    code, text, _ = run(
+        capsys, "spillover", design, "--out", out, "--pdf", "--tolerance", "patch=5e-4"
+    )
     assert code == 0 and "passed: gain margin 2.88, 2 required" in text
+    assert CHANGE.text in text
     figures = [
         f"{name}.{kind}"
         for name in ("margins", "damping", "leakage", "laws")
@@ -492,6 +512,11 @@ def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_
     data = json.loads((out / "certificate.json").read_text())
     jsonschema.validate(data, schema("spillover"))
     assert data["is_passed"] and len(data["plants"]) == 8 and len(data["laws"]) == 7
+    assert "| delay | 0.5 samples late | +2.00 |" in report and "patch 0.0005 m," in report
+    assert data["smallest_change"] == CHANGE.record() | {
+        "changes": [part._asdict() for part in CHANGE.parts],
+        "tolerances": TOLERANCES._replace(patch=5e-4)._asdict(),
+    }
     assert all(plant["passes"] for plant in data["plants"])
     with xarray.open_dataset(out / "spillover.h5") as store:
         margin = store.gain_margin.sel(basis="pinned_pinned", plant_modes=9)

@@ -10,6 +10,7 @@ from threadpoolctl import threadpool_limits
 from jaxmodel.beam import BASES
 from jaxmodel.controller import linear_parts
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
+from studies.engine.breaking import BreakingChange
 from studies.engine.controller import FixedController, fixed_controller
 from studies.engine.host_loop import SampledLoop, name_motion
 from studies.engine.stability import LoopFigures, judge_loop, worst_figures
@@ -65,6 +66,7 @@ class Certificate(NamedTuple):
     actuation: np.ndarray  # modal force per channel force, (B, D, 3, R, C)
     notes: tuple[str, ...]  # what was left out, and why
     proofs: Proofs | None = None  # beyond these plants, if they were asked for
+    smallest_change: BreakingChange | None = None  # that breaks the design; None: not looked for
 
     def _repr_html_(self) -> str:
         return shown(self)

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from studies.config import start
+from studies.sweeps.commands import Tolerance
 
 
 def add_commands(app: typer.Typer, console: Console) -> None:
@@ -35,6 +36,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
                 help="also prove stability for every number of modes and a box of machines",
             ),
         ] = False,
+        tolerance: Tolerance = None,
         pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
     ) -> None:
         """Certify a controller on plants that differ from its model."""
@@ -42,9 +44,18 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
         check_folder(out)
         start()
+        from studies.engine.breaking import parse_tolerances
         from studies.engine.design import load_design
         from studies.spillover.run import spillover_design
 
-        certificate = spillover_design(load_design(design, case), out, margin, console, pdf, prove)
-        if not certificate.is_passed:
+        made = spillover_design(
+            load_design(design, case),
+            out,
+            margin,
+            console,
+            pdf,
+            prove,
+            parse_tolerances(tolerance or []),
+        )
+        if not made.is_passed:
             sys.exit(1)

@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_limits
 from jaxmodel.beam import BASES
 from jaxmodel.branch_and_bound import Cells, exclude_zeros, start_cells
 from jaxmodel.controller import Controller, linear_parts
+from jaxmodel.drives import DRIVES
 from jaxmodel.modal_loop import ModalLoop, modal_loop
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, delayed_loop
 from jaxmodel.zero_exclusion import prepare_exclusion
@@ -152,7 +153,7 @@ def prove_all_modes(design: FixedController, law: Controller) -> AllModes:
     """
     builder = LoopBuilder(design)
     plant = PlantVariant(SINES, LARGEST)
-    fault = builder.fault(plant)
+    fault = builder.fault(plant) or _not_covered(design)
     if fault:
         return AllModes(0.0, np.nan, LARGEST, fault)
     base = gain_margin(builder.loop(plant, law).poles)
@@ -182,6 +183,17 @@ def _payload(design: FixedController, more: float) -> tuple[float, float]:
     return own, own + more
 
 
+def _not_covered(design: FixedController) -> str:
+    """What the return difference of `modal_loop` has no form for, "" for nothing."""
+    if design.structure.has_delay:
+        return "it covers a delay of one sample alone (electronics.delay, unmodelled_delay)"
+    if DRIVES[design.structure.drive].is_sampled:
+        return (
+            f"it covers drives in continuous time alone (drive.kind = {design.structure.drive!r})"
+        )
+    return ""
+
+
 def prove_box(design: FixedController, law: Controller, seconds: float) -> ProvenBox:
     """Zero exclusion over `BOX`, from one stable machine of it.
 
@@ -195,6 +207,8 @@ def prove_box(design: FixedController, law: Controller, seconds: float) -> Prove
     nothing = ProvenBox(
         ranges=BOX, undecided=1.0, has_all_modes=has_tail, n_base=LARGEST, cells=0, seconds=0.0
     )
+    if fault := _not_covered(design):
+        return nothing._replace(fault=fault)
     if not BASES[basis].is_on_chord:
         return nothing._replace(fault=f"{basis}: its modes move the far ends of the links")
     if design.structure.has_wrench and not has_tail:

@@ -11,6 +11,7 @@ from markupsafe import Markup
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.state_space import STATE_SPACE
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
+from studies.engine.breaking import UNITS
 from studies.show.document import json_text
 from studies.show.pages import page
 from studies.show.sketch import CAPTION
@@ -83,6 +84,9 @@ def report(certificate: Certificate, laws: Comparison | None, images: Path | Non
         breaking=certificate.breaking[certificate.worst],
         residual=_residual(laws) if laws is not None else None,
         spillover=spillover_text(certificate),
+        change=certificate.smallest_change,
+        units=UNITS._asdict(),
+        change_rows=_changes(certificate),
         damping=damping_text(certificate),
         proofs=proof_texts(certificate.proofs) if certificate.proofs is not None else (),
         margin=margin,
@@ -147,6 +151,13 @@ def _margins(certificate: Certificate) -> list[list[str]]:
             ]
         )
     return rows
+
+
+def _changes(certificate: Certificate) -> list[list[str]]:
+    """Row of each number of the smallest change that breaks the design."""
+    change = certificate.smallest_change
+    parts = () if change is None else change.parts
+    return [[part.name, part.text.removeprefix(part.name), f"{part.size:+.2f}"] for part in parts]
 
 
 def _leakage(certificate: Certificate) -> dict[str, Any] | None:
@@ -216,6 +227,7 @@ def document(certificate: Certificate, laws: Comparison | None) -> str:
         "notes": list(certificate.notes),
         "plants": [_plant(certificate, tuple(at)) for at in np.argwhere(certificate.exists)],
         "proofs": certificate.proofs and _proofs(certificate.proofs),
+        "smallest_change": certificate.smallest_change and certificate.smallest_change.record(),
         "laws": [] if laws is None else [_law(laws, k) for k in range(len(laws.names))],
         "study": certificate.study.model_dump(mode="json"),
     }

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from jaxmodel.changes import MachineChange
 from jaxmodel.laws import LAWS
+from studies.engine.breaking import TOLERANCES, smallest_change
 from studies.engine.controller import fixed_controller
 from studies.engine.design import Design
 from studies.engine.progress import Phases
@@ -30,7 +32,7 @@ from studies.study.labels import STATUS_LABEL
 from studies.study.spec import Study
 
 DOCUMENT, DATA = "certificate.json", "spillover.h5"
-PHASES = ("judge", "compare laws", "draw")
+PHASES = ("judge", "smallest change", "compare laws", "draw")
 
 
 def spillover_design(
@@ -40,6 +42,7 @@ def spillover_design(
     console: Console | None = None,
     has_pdf: bool = False,
     has_proofs: bool = False,
+    tolerances: MachineChange = TOLERANCES,
 ) -> Certificate:
     """Write the certificate of a design, and the comparison of laws on its machine.
 
@@ -51,6 +54,7 @@ def spillover_design(
         has_pdf: also write the figures as PDF.
         has_proofs: also prove stability for every number of modes and for a box of machines, where
             that is possible within a minute or two.
+        tolerances: units of the smallest change that breaks it, see `smallest_change`.
 
     Returns:
         the certificate; `is_passed`: whether the design passes.
@@ -75,6 +79,10 @@ def spillover_design(
             certificate = certificate._replace(proofs=proofs)
             for text in proof_texts(proofs):
                 console.print(text, soft_wrap=True)
+        phases.begin("smallest change", "of the machine that breaks the design")
+        change = smallest_change(fixed_controller(certificate.study), tolerances)
+        certificate = certificate._replace(smallest_change=change)
+        console.print(change.text, soft_wrap=True)
         phases.begin("compare laws")
         laws = None
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import typer
 from rich.console import Console
@@ -18,6 +18,14 @@ from studies.show.document import AsJson, print_document
 
 #: Replaced in names of files: the brackets of entries.
 _NO_NAME = r"[^\w.-]+"
+#: Of the commands that look for the smallest change that breaks a design.
+Tolerance: TypeAlias = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="NAME=VALUE, one unit of a kind of change that may break a design: stiffness, "
+        "damping, payload, patch, delay, actuator, sensor, joint_inertia; 0: it does not change"
+    ),
+]
 Folder = Annotated[Path, typer.Argument(help="folder of a sweep")]
 
 
@@ -151,9 +159,18 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         by: Annotated[str, typer.Option(help="metric; the best come first, after - the worst")],
         subject_to: Annotated[str, typer.Option(help="condition on metrics and axes")] = "",
         count: Annotated[int, typer.Option(min=1, help="number of cases")] = 10,
+        breaks: Annotated[
+            bool,
+            typer.Option("--breaks", help="also name the smallest change that breaks each of them"),
+        ] = False,
+        tolerance: Tolerance = None,
         as_json: AsJson = False,
     ) -> None:
         """List the best cases of a sweep by a metric."""
+        if tolerance and not breaks:
+            raise StudyError("--tolerance: for --breaks only; give both")
+        if breaks:
+            start()
         from studies.engine.results import direction, read_sweep
         from studies.sweeps.show import (
             counted_text,
@@ -167,13 +184,26 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if as_json:
             from studies.sweeps.documents import best_document
 
-            print_document("best", best_document(data, by, subject_to, count))
+            document = best_document(data, by, subject_to, count)
+            if breaks:
+                from studies.sweeps.breaking import breaking_changes
+
+                numbers = [case["case"] for case in document["cases"]]
+                document["smallest_changes"] = [
+                    entry.record() for entry in breaking_changes(folder, numbers, tolerance or [])
+                ]
+            print_document("best", document)
             return
         cases = ranked_cases(data, by, subject_to, count)
         print_uncontrolled(data, name, console)
         console.print(f"by {name}, {direction(by)} first, {counted_text(data, name)}:")
         print_cases(data, cases, [name], console)
         print_left_out(data, console)
+        if breaks:
+            from studies.sweeps.breaking import breaking_changes
+
+            for entry in breaking_changes(folder, cases.tolist(), tolerance or []):
+                console.print(f"case {entry.case}: {entry.text}", soft_wrap=True)
 
     @app.command()
     def plot(
