@@ -17,6 +17,7 @@ from .extensions import extend
 from .fitting.estimate import fit
 from .fitting.run import run_fit
 from .fitting.spec import load_fit
+from .laws.run import run_laws
 from .paper.run import run_paper
 from .show.document import schema
 from .single.plant import plant_of, write_plant
@@ -75,6 +76,7 @@ __all__ = [
     "run_atlas",
     "run_bench",
     "run_fit",
+    "run_laws",
     "run_paper",
     "run_study",
     "run_sweep",

@@ -3,6 +3,7 @@
 import json
 
 import jax
+import jsonschema
 import numpy as np
 import pytest
 
@@ -16,6 +17,7 @@ from studies.laws.candidates import AS_GIVEN, Candidate, drive_candidates, law_c
 from studies.laws.judging import MOVES, changes, judging_sweep, machines_of
 from studies.laws.ranking import rank
 from studies.laws.tuning import Budget, Tuned, make_budget, tuning_of
+from studies.show.document import schema
 from studies.space.table import build_table
 from studies.study.cases import build_cases, build_structure
 from studies.study.spec import paper_study
@@ -124,9 +126,10 @@ def test_a_comparison_writes_a_page_whose_order_is_that_of_the_runs(tmp_path, mo
     drive = Tuned(Candidate("PD", {}, {}, {}, is_drive=True), STUDY, "", 1.0, 2, 8)
     monkeypatch.setattr(laws, "_tune", lambda *arguments: [*candidates, drive])
     monkeypatch.setattr(laws, "MACHINES", 3)
-    findings = laws.run_laws(STUDY, tmp_path / "out", Budget(50.0, 0.4), is_quiet=True)
+    findings = laws.run_laws(STUDY, tmp_path / "out", 50.0, 0.4, is_quiet=True)
     assert findings.name(findings.ranking.best) == "strong; PD"
     document = json.loads((tmp_path / "out" / "laws.json").read_text())
+    jsonschema.validate(document, schema("laws"))
     names = [entry["name"] for entry in document["controllers"]]
     assert names[:2] == ["strong; PD", "weak; PD"]
     own = findings.judged.metrics["residual_rms"]
@@ -135,4 +138,4 @@ def test_a_comparison_writes_a_page_whose_order_is_that_of_the_runs(tmp_path, mo
     assert weak["ratio"]["residual_rms"][0] == pytest.approx(wanted)
     assert "strong; PD" in (tmp_path / "out" / "report.html").read_text()
     with pytest.raises(StudyError, match="another design, budget or program"):
-        laws.run_laws(STUDY, tmp_path / "out", Budget(40.0, 0.4), is_resumed=True, is_quiet=True)
+        laws.run_laws(STUDY, tmp_path / "out", 40.0, 0.4, is_resumed=True, is_quiet=True)

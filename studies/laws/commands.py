@@ -43,11 +43,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         start()
         from studies.engine.design import load_design
         from studies.laws.run import run_laws
-        from studies.laws.tuning import make_budget
 
         study = load_design(design, case).study
         try:
-            run_laws(study, out, make_budget(study, voltage, margin), resume, console, quiet)
+            run_laws(study, out, voltage, margin, resume, console, quiet)
         except KeyboardInterrupt:
             print(
                 f"studies: interrupted; finished work is safe; continue with --resume --out {out}",

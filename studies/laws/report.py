@@ -11,6 +11,7 @@ from studies.laws.findings import LawFindings, verdict
 from studies.laws.judging import FIGURES, MOVES
 from studies.laws.ranking import CONFIDENCE
 from studies.laws.tuning import SPREAD
+from studies.show.document import json_text
 from studies.show.pages import page
 from studies.show.sketch import CAPTION
 from studies.show.units import number
@@ -20,7 +21,7 @@ from studies.study.margin import margin_text
 COLUMNS = (
     ("residual_rms", "m", np.median),
     ("settling_time", "s", np.median),
-    ("pose_error_rms", "m", np.median),
+    ("pose_error_peak", "m", np.median),
     ("peak_voltage", "V", np.max),
     ("control_energy", "V2 s", np.mean),
 )
@@ -29,7 +30,7 @@ HEADS = (
     "residual rms, median [µm]",
     "over the best (95 %)",
     "settling, median [ms]",
-    "platform error, median [µm]",
+    "platform error while moving, median [µm]",
     "largest voltage [V]",
     "control energy, mean [V² s]",
     "gain margin, worst [1]",
@@ -89,7 +90,7 @@ def _row(findings: LawFindings, k: int) -> list[str]:
         number(values["residual_rms"], "m"),
         _ratio(findings, k),
         number(values["settling_time"], "s"),
-        number(values["pose_error_rms"], "m"),
+        number(values["pose_error_peak"], "m"),
         number(values["peak_voltage"], "V"),
         f"{values['control_energy']:.3g}",
         margin_text(float(np.nanmin(margins))) if has_margin else "-",
@@ -119,11 +120,9 @@ def _ratio(findings: LawFindings, k: int) -> str:
     )
 
 
-def document(findings: LawFindings) -> dict[str, Any]:
-    """The same as numbers in SI units."""
-    return {
-        "format": "flexlink-laws",
-        "format_version": 1,
+def document(findings: LawFindings) -> str:
+    """The same as a JSON document, numbers in SI units."""
+    whole = {
         "title": findings.study.title,
         "budget": findings.budget._asdict(),
         "verdict": verdict(findings),
@@ -131,6 +130,7 @@ def document(findings: LawFindings) -> dict[str, Any]:
         "failed": [{"name": x.candidate.name, "reason": x.reason} for x in findings.failed],
         "study": findings.study.model_dump(mode="json"),
     }
+    return json_text("laws", whole)
 
 
 def _entry(findings: LawFindings, k: int) -> dict[str, Any]:
@@ -143,19 +143,15 @@ def _entry(findings: LawFindings, k: int) -> dict[str, Any]:
         "reason": controller.reason,
         "numbers_tuned": controller.entry.n_free,
         "products": controller.products,
-        "gain_margin": _number(_over(judged.gain_margin[k], np.min)),
+        "gain_margin": _over(judged.gain_margin[k], np.min),
         "breaking": "" if controller.loop is None else controller.loop.breaking,
         "runs_lost": int(judged.n_lost[k]),
     }
-    entry |= {name: _number(_over(judged.metrics[name][k], over)) for name, _, over in COLUMNS}
+    entry |= {name: _over(judged.metrics[name][k], over) for name, _, over in COLUMNS}
     if k in rows:
         place = rows.index(k)
         entry["ratio"] = {
-            metric: [_number(x[place]) for x in (ranking.ratio, ranking.low, ranking.high)]
+            metric: [x[place] for x in (ranking.ratio, ranking.low, ranking.high)]
             for metric, ranking in findings.rankings.items()
         }
     return entry
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -33,7 +32,7 @@ from studies.laws.findings import (
 )
 from studies.laws.judging import judging_sweep, machines_of, read_judged
 from studies.laws.report import document, report
-from studies.laws.tuning import Budget, Tuned, tune_candidate
+from studies.laws.tuning import Budget, Tuned, make_budget, tune_candidate
 from studies.publish import REPORT, publish, replacing
 from studies.reading import read_json
 from studies.show.figures import save, styled, write_figure
@@ -51,7 +50,8 @@ MACHINES = 16
 def run_laws(
     study: Study,
     out: str | Path,
-    budget: Budget,
+    voltage: float | None = None,
+    margin: float = 0.4,
     is_resumed: bool = False,
     console: Console | None = None,
     is_quiet: bool = False,
@@ -61,13 +61,14 @@ def run_laws(
     Args:
         study: the design, with sampled feedback.
         out: folder.
-        budget: what each candidate may spend.
+        voltage: largest of an actuator [V]; None: what the design itself needs in its motion.
+        margin: least disk margin [1].
         is_resumed: continue an interrupted comparison.
         console: where progress goes; default: standard output.
         is_quiet: hide progress.
 
     Raises:
-        StudyError: a fault of the design or the folder; no candidate can be tuned.
+        StudyError: a fault of the design, a limit or the folder; no candidate can be tuned.
         KeyboardInterrupt: Ctrl-C; what is finished stays.
     """
     config.require_configured()
@@ -79,6 +80,7 @@ def run_laws(
             "'sampled', with a controlled link: what is compared is a sampled controller",
         )
     study = with_window(resolved_study(study))
+    budget = make_budget(study, voltage, margin)
     with locked_folder(out, "comparison"):
         refuse_existing(out, COMPARISONS, is_resumed)
         _keep_request(out / COMPARISONS.mark, study, budget)
@@ -176,6 +178,5 @@ def _write(findings: LawFindings, out: Path) -> None:
             save(plots.comparison(findings), staging, "laws")
             save(plots.grid(findings), staging, "grid")
             write_figure(sketch(findings.study), staging / "machine.png")
-        described: dict[str, Any] = document(findings)
-        (staging / DOCUMENT).write_text(json.dumps(described, indent=1), encoding="utf-8")
+        (staging / DOCUMENT).write_text(document(findings), encoding="utf-8")
         (staging / REPORT).write_text(report(findings, staging), encoding="utf-8")
