@@ -13,7 +13,7 @@ from studies.engine.distinct import distinct_loops, judge_cases
 from studies.engine.margins import judge_loops
 from studies.errors import StudyError
 from studies.laws import run as laws
-from studies.laws.candidates import AS_GIVEN, Candidate, drive_candidates, law_candidates
+from studies.laws.candidates import AS_GIVEN, Contender, drive_candidates, law_candidates
 from studies.laws.judging import MOVES, changes, judging_sweep, machines_of
 from studies.laws.ranking import rank
 from studies.laws.tuning import Budget, Tuned, make_budget, tuning_of
@@ -117,13 +117,17 @@ def test_budget_from_the_command_line():
             make_budget(STUDY, **({"voltage": 20.0, "margin": 0.4} | bad))
 
 
+def tuned(candidate, study):
+    return Tuned(candidate=candidate, study=study, reason="", objective=1.0, n_free=1, runs=8)
+
+
 def test_a_comparison_writes_a_page_whose_order_is_that_of_the_runs(tmp_path, monkeypatch):
     factors = {"weak": 0.1, "strong": 0.6}
     candidates = [
-        Tuned(Candidate(name, {}, {}, {}), STUDY.change(control__gain_factor=x), "", 1.0, 1, 8)
+        tuned(Contender(name, {}, {}, {}), STUDY.change(control__gain_factor=x))
         for name, x in factors.items()
     ]
-    drive = Tuned(Candidate("PD", {}, {}, {}, is_drive=True), STUDY, "", 1.0, 2, 8)
+    drive = tuned(Contender("PD", {}, {}, {}, is_drive=True), STUDY)
     monkeypatch.setattr(laws, "_tune", lambda *arguments: [*candidates, drive])
     monkeypatch.setattr(laws, "MACHINES", 3)
     findings = laws.run_laws(STUDY, tmp_path / "out", 50.0, 0.4, is_quiet=True)

@@ -48,7 +48,7 @@ SHARED: dict[str, dict[str, Any]] = {
 NUDGE = 1.01
 
 
-class Candidate(NamedTuple):
+class Contender(NamedTuple):
     """A law or a drive, and the numbers it is tuned by."""
 
     name: str  # in tables
@@ -64,7 +64,7 @@ class Candidate(NamedTuple):
         return study
 
 
-def law_candidates(study: Study) -> list[Candidate]:
+def law_candidates(study: Study) -> list[Contender]:
     """All laws for which a study needs no matrices of its own, the design's law among them.
 
     Gains of modes also with the ratios (24) of the design, where they are all free otherwise.
@@ -84,11 +84,11 @@ def law_candidates(study: Study) -> list[Candidate]:
     return found
 
 
-def _law_candidate(study: Study, law: Law) -> Candidate:
+def _law_candidate(study: Study, law: Law) -> Contender:
     settings: dict[str, Any] = {"control.law": law.name}
     if study.control.has_poles and not law.places_poles:
         settings |= {"control.damping": (), "control.pole_decay": ()}
-    plain = Candidate(law.text, settings, {}, OF_LAWS)
+    plain = Contender(law.text, settings, {}, OF_LAWS)
     own = plain.study(study)
     if law.channel == "patch" and law.name != study.control.law:  # its gains have another unit
         gains = np.array(study.control.velocity_gain) / _strength(*check_run(own))
@@ -100,7 +100,7 @@ def _law_candidate(study: Study, law: Law) -> Candidate:
     return plain._replace(free=free)
 
 
-def drive_candidates(study: Study) -> list[Candidate]:
+def drive_candidates(study: Study) -> list[Contender]:
     """All drives, the design's among them.
 
     Args:
@@ -109,9 +109,9 @@ def drive_candidates(study: Study) -> list[Candidate]:
     return [_drive_candidate(study, law) for law in DRIVES.values()]
 
 
-def _drive_candidate(study: Study, law: DriveLaw) -> Candidate:
+def _drive_candidate(study: Study, law: DriveLaw) -> Contender:
     settings = {"drive.kind": law.name}
-    plain = Candidate(law.text, settings, {}, OF_DRIVES, is_drive=True)
+    plain = Contender(law.text, settings, {}, OF_DRIVES, is_drive=True)
     own = plain.study(study)
     gains = {"drive.kp": own.drive.kp, "drive.kd": own.drive.kd}
     free = {name: around(x, share=SERVO) for name, x in gains.items() if _serves(own, name)}

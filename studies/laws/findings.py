@@ -23,7 +23,7 @@ from studies.study.spec import Study, parse_study
 GIVEN, WITHOUT = "the design as given", "without control"
 
 
-class Entry(NamedTuple):
+class Combination(NamedTuple):
     """A controller to compare."""
 
     name: str  # in tables
@@ -34,10 +34,10 @@ class Entry(NamedTuple):
     n_free: int  # numbers it was tuned by
 
 
-class Controller(NamedTuple):
+class Compared(NamedTuple):
     """One controller of the comparison."""
 
-    entry: Entry
+    entry: Combination
     reason: str  # why it is out of the competition, "" if it is not
     loop: LoopFigures | None  # of its own machine; None without control
     products: int | None  # multiplications a sample; None without control
@@ -48,7 +48,7 @@ class LawFindings(NamedTuple):
 
     study: Study  # the design
     budget: Budget
-    controllers: list[Controller]  # those that ran, in the order of `judged`
+    controllers: list[Compared]  # those that ran, in the order of `judged`
     failed: list[Tuned]  # those of which no design came
     judged: Judged
     rankings: dict[str, Ranking]  # by metric of FIGURES, of the controllers in the competition
@@ -69,7 +69,7 @@ class LawFindings(NamedTuple):
 
 
 def find(
-    study: Study, budget: Budget, tuned: list[Tuned], judged: Judged, figures: list[Controller]
+    study: Study, budget: Budget, tuned: list[Tuned], judged: Judged, figures: list[Compared]
 ) -> LawFindings:
     """Rank what was judged.
 
@@ -81,7 +81,12 @@ def find(
         figures: the controllers.
     """
     findings = LawFindings(
-        study, budget, figures, [x for x in tuned if x.study is None], judged, {}
+        study=study,
+        budget=budget,
+        controllers=figures,
+        failed=[x for x in tuned if x.study is None],
+        judged=judged,
+        rankings={},
     )
     rows = findings.competing
     rankings = {
@@ -95,7 +100,12 @@ def _complete(judged: Judged, figure: np.ndarray) -> np.ndarray:
     return np.where(np.isin(judged.status, status.FINISHED), figure, np.nan)
 
 
-def combinations(study: Study, tuned: list[Tuned]) -> list[Entry]:
+def as_given(name: str, study: Study) -> Combination:
+    """What stands beside the competition: a study as it is."""
+    return Combination(name=name, law="", drive="", study=study, reason="not tuned", n_free=0)
+
+
+def combinations(study: Study, tuned: list[Tuned]) -> list[Combination]:
     """Every tuned law with every tuned drive.
 
     Laws are tuned on the design's drive and drives with the design's law: the links see the drive
@@ -118,12 +128,12 @@ def combinations(study: Study, tuned: list[Tuned]) -> list[Entry]:
     return [_combined(study, law, drive) for law in laws for drive in drives]
 
 
-def _combined(study: Study, law: Tuned, drive: Tuned) -> Entry:
+def _combined(study: Study, law: Tuned, drive: Tuned) -> Combination:
     assert law.study is not None and drive.study is not None
     both = law.study
     for name, value in changes(study, drive.study).items():
         both = parse_study(set_value(both, name, value))
-    return Entry(
+    return Combination(
         name=f"{law.candidate.name}; {drive.candidate.name}",
         law=law.candidate.name,
         drive=drive.candidate.name,
@@ -133,18 +143,18 @@ def _combined(study: Study, law: Tuned, drive: Tuned) -> Entry:
     )
 
 
-def examine(entry: Entry) -> Controller:
+def examine(entry: Combination) -> Compared:
     """A controller's loop on its own machine, and what a sample of it costs."""
     study = entry.study
     if not study.is_controlled:
-        return Controller(entry, entry.reason, None, None)
+        return Compared(entry, entry.reason, None, None)
     structure, case = check_run(study)
     pose = np.array(study.motion.waypoints[0], float)
     loop = loop_report(structure, case, pose, structure.n_controlled)
     reason = entry.reason
     if not loop.is_stable:
         reason = "; ".join(filter(None, (reason, "unstable")))
-    return Controller(entry, reason, loop, products_of(fixed_controller(study).channels))
+    return Compared(entry, reason, loop, products_of(fixed_controller(study).channels))
 
 
 def verdict(findings: LawFindings) -> list[str]:

@@ -23,8 +23,8 @@ from studies.laws.candidates import drive_candidates, law_candidates
 from studies.laws.findings import (
     GIVEN,
     WITHOUT,
-    Entry,
     LawFindings,
+    as_given,
     combinations,
     examine,
     find,
@@ -126,8 +126,8 @@ def _empty_sweep(study: Study) -> SweepSpec:
 def _compare(study: Study, out: Path, budget: Budget, phases: Phases) -> LawFindings:
     tuned = _tune(study, out, budget, phases)
     entries = [
-        Entry(WITHOUT, "", "", study.uncontrolled(), "not tuned", 0),
-        Entry(GIVEN, "", "", study, "not tuned", 0),
+        as_given(WITHOUT, study.uncontrolled()),
+        as_given(GIVEN, study),
         *combinations(study, tuned),
     ]
     machines = machines_of(study, MACHINES, budget.seed + 1)

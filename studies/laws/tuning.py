@@ -15,7 +15,7 @@ import numpy as np
 from jaxmodel import status
 from studies.engine.runs import run_study
 from studies.errors import StudyError, field_error
-from studies.laws.candidates import Candidate
+from studies.laws.candidates import Contender
 from studies.study.labels import describe
 from studies.study.spec import Study
 from studies.tuning.check import tuned_study
@@ -70,7 +70,7 @@ def make_budget(study: Study, voltage: float | None, margin: float) -> Budget:
 class Tuned(NamedTuple):
     """A candidate after its tuning."""
 
-    candidate: Candidate
+    candidate: Contender
     study: Study | None  # with its best numbers; None: no run of it finished
     reason: str  # why there is none, or which limit it does not keep; "" if all is well
     objective: float  # over that of the design as given [1]
@@ -78,7 +78,7 @@ class Tuned(NamedTuple):
     runs: int  # of the tuning
 
 
-def tuning_of(study: Study, candidate: Candidate, budget: Budget) -> TuneSpec:
+def tuning_of(study: Study, candidate: Contender, budget: Budget) -> TuneSpec:
     """The tuning of a candidate.
 
     Raises:
@@ -99,7 +99,7 @@ def tuning_of(study: Study, candidate: Candidate, budget: Budget) -> TuneSpec:
 
 def tune_candidate(
     study: Study,
-    candidate: Candidate,
+    candidate: Contender,
     budget: Budget,
     file: Path,
     say: Callable[[str], None],
@@ -117,14 +117,32 @@ def tune_candidate(
         spec = tuning_of(study, candidate, budget)
         at = _optimised(spec, file, say)
     except StudyError as error:
-        return Tuned(candidate, None, str(error), np.nan, len(candidate.free), 0)
+        return _untuned(candidate, str(error), 0)
     best, family = at.winner(0), spec.moving[0]
     count, runs = int(family.is_free.sum()), int(at.iteration) * budget.starts * budget.machines
     objective = float(at.best_objective[best])
     if not np.isfinite(objective):
-        return Tuned(candidate, None, "no start finished a run", np.nan, count, runs)
+        return _untuned(candidate, "no start finished a run", runs)
     tuned = tuned_study(spec, family, spec.free.values(at.best_place[best]))
-    return Tuned(candidate, tuned, _violated(spec, at, best), objective, count, runs)
+    return Tuned(
+        candidate=candidate,
+        study=tuned,
+        reason=_violated(spec, at, best),
+        objective=objective,
+        n_free=count,
+        runs=runs,
+    )
+
+
+def _untuned(candidate: Contender, reason: str, runs: int) -> Tuned:
+    return Tuned(
+        candidate=candidate,
+        study=None,
+        reason=reason,
+        objective=float("nan"),
+        n_free=len(candidate.free),
+        runs=runs,
+    )
 
 
 def _optimised(spec: TuneSpec, file: Path, say: Callable[[str], None]) -> Progress:
