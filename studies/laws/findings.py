@@ -34,7 +34,7 @@ class Combination(NamedTuple):
     n_free: int  # numbers it was tuned by
 
 
-class Compared(NamedTuple):
+class ExaminedController(NamedTuple):
     """One controller of the comparison."""
 
     entry: Combination
@@ -48,7 +48,7 @@ class LawFindings(NamedTuple):
 
     study: Study  # the design
     budget: Budget
-    controllers: list[Compared]  # those that ran, in the order of `judged`
+    controllers: list[ExaminedController]  # those that ran, in the order of `judged`
     failed: list[Tuned]  # those of which no design came
     judged: Judged
     rankings: dict[str, Ranking]  # by metric of FIGURES, of the controllers in the competition
@@ -69,7 +69,11 @@ class LawFindings(NamedTuple):
 
 
 def find(
-    study: Study, budget: Budget, tuned: list[Tuned], judged: Judged, figures: list[Compared]
+    study: Study,
+    budget: Budget,
+    tuned: list[Tuned],
+    judged: Judged,
+    figures: list[ExaminedController],
 ) -> LawFindings:
     """Rank what was judged.
 
@@ -143,18 +147,18 @@ def _combined(study: Study, law: Tuned, drive: Tuned) -> Combination:
     )
 
 
-def examine(entry: Combination) -> Compared:
+def examine(entry: Combination) -> ExaminedController:
     """A controller's loop on its own machine, and what a sample of it costs."""
     study = entry.study
     if not study.is_controlled:
-        return Compared(entry, entry.reason, None, None)
+        return ExaminedController(entry, entry.reason, None, None)
     structure, case = check_run(study)
     pose = np.array(study.motion.waypoints[0], float)
     loop = loop_report(structure, case, pose, structure.n_controlled)
     reason = entry.reason
     if not loop.is_stable:
         reason = "; ".join(filter(None, (reason, "unstable")))
-    return Compared(entry, reason, loop, products_of(fixed_controller(study).channels))
+    return ExaminedController(entry, reason, loop, products_of(fixed_controller(study).channels))
 
 
 def verdict(findings: LawFindings) -> list[str]:
