@@ -21,16 +21,12 @@ from jaxmodel.frequency_response import (
     command_gain_images,
 )
 from jaxmodel.lazy import jax, jnp
+from jaxmodel.loop_figures import MARGINS, MOST_DELAY, PEAKS
 from jaxmodel.parameters import Array
 from jaxmodel.return_difference import NARROWEST, assembled_modes
 from jaxmodel.scaling import best_scaling, scaled
 from jaxmodel.state_space import StateSpace
 
-#: Lower limits of a loop, 0: it is unstable; upper ones, its largest singular values.
-MARGINS = ("disk_margin", "phase_margin", "delay_margin")
-PEAKS = ("sensitivity_peak", "control_effort_peak", "disturbance_deflection_peak")
-#: The search for a delay ends here [samples]; a phase margin is at most 180 deg.
-MOST_DELAY, MOST_PHASE = 16.0, 180.0
 #: Frequencies of a search: evenly on a logarithmic axis, and beside each mode.
 BACKGROUND, BESIDE = 120, np.tan(np.linspace(-1.45, 1.45, 12))
 LOWEST_HZ = 0.5
@@ -94,20 +90,6 @@ def robustness_figures(response: SampledLoopResponse, names: tuple[str, ...]) ->
 _FIELD = {name: name.removesuffix("_peak") for name in PEAKS}
 #: Frequencies at once, which stay in a processor's cache.
 BATCH = 49
-
-
-def guaranteed_range(disk_margin: Array) -> tuple[Array, Array]:
-    """Gain [dB] and phase [deg] by which every actuator may err at once, either way.
-
-    (2 + alpha)/(2 - alpha) and 2 atan(alpha/2) (Seiler, Packard and Gahinet 2020, sigma = 0).
-
-    Args:
-        disk_margin: alpha, 0 to 2 [1].
-    """
-    alpha = np.minimum(disk_margin, 2.0)
-    with np.errstate(divide="ignore"):
-        gain = 20 * np.log10((2 + alpha) / (2 - alpha))
-    return gain, np.rad2deg(2 * np.arctan(alpha / 2))
 
 
 def search_frequencies(response: SampledLoopResponse) -> Array:

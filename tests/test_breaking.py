@@ -148,8 +148,9 @@ def test_a_delay_is_a_later_edge_of_the_hold(design, delay):
     state = rng.normal(size=len(matrix))
     state *= np.concatenate([size[:n], np.full(len(state) - n, 1e6)])
     x = state[:n]
-    # the command that would be held without delay stands before the two older ones
-    commands = [state[-27:-18], state[-18:-9], state[-9:]][whole : whole + 2][::-1]
+    # the newest command is the controller's, older ones follow the plant's state, newest first
+    latest = [state[-9:], *np.split(state[n : n + 27], 3)]
+    commands = latest[whole : whole + 2][::-1]
     for part, command in zip(parts, commands, strict=True):
         x = (part @ np.concatenate([x, command]))[:n]
     moved = matrix @ state

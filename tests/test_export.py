@@ -231,7 +231,9 @@ def test_fuzzing_notices_a_fault(capsys, designs, folders, tmp_path):
     broken.mkdir()
     (broken / "flexlink.h").write_text((out / "flexlink.h").read_text())
     code = (out / "flexlink.c").read_text()
-    (broken / "flexlink.c").write_text(code.replace("wanted[k] = LIMIT;", "wanted[k] = 2 * LIMIT;"))
+    (broken / "flexlink.c").write_text(
+        code.replace("volts > LIMIT ? LIMIT", "volts > 2 * LIMIT ? 2 * LIMIT")
+    )
     with pytest.raises(AssertionError, match="out of range"):
         fuzz(broken, "c", tmp_path, 10_000, 1)
 

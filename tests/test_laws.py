@@ -9,7 +9,7 @@ import pytest
 
 from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
-from studies.engine.distinct import distinct_loops, judge_cases
+from studies.engine.chunks import distinct_loops, judge_cases
 from studies.engine.margins import judge_loops
 from studies.errors import StudyError
 from studies.laws import run as laws

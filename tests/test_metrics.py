@@ -281,7 +281,7 @@ def test_equal_ratios_where_mode_1_is_quiet():
 @jax.jit
 def signals_at(loop, plant, inputs, voltage):
     """What the metrics read and trajectories do not hold."""
-    rates = plant_rates(STRUCTURE, loop, plant, _reference(inputs, 0), voltage)
+    rates = plant_rates(STRUCTURE, loop, plant, _reference(inputs, 0, None), voltage)
     axial = rates.acceleration.axial
     return axial, stretch_error(rates.chain, loop.axial_compliance * axial)
 

@@ -511,7 +511,7 @@ def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_
     assert len(page.images) == 5 and page.title.startswith("Spillover certificate passed")
     data = json.loads((out / "certificate.json").read_text())
     jsonschema.validate(data, schema("spillover"))
-    assert data["is_passed"] and len(data["plants"]) == 8 and len(data["laws"]) == 7
+    assert data["is_passed"] and len(data["plants"]) == 8 and len(data["laws"]) == 9
     assert "| delay | 0.5 samples late | +2.00 |" in report and "patch 0.0005 m," in report
     assert data["smallest_change"] == CHANGE.record() | {
         "changes": [part._asdict() for part in CHANGE.parts],

@@ -10,7 +10,7 @@ from studies.errors import StudyError
 from studies.study import spec as spec_module
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.numbers import one_study
-from studies.study.paths import set_value
+from studies.study.paths import Parts, set_value
 from studies.study.spec import parse_study
 from studies.tuning.evaluate import Evaluator
 from studies.tuning.objective import tail_weights
@@ -85,8 +85,8 @@ def test_poles_can_be_free():
     spec = parse_tuning({**SMALL, "control": control, "tune": {"free": free}})
     assert (
         len(spec.free.names) == 5
-        and spec.has_poles(spec.law())
-        and spec.has_position_gain(spec.law())
+        and spec.has_poles(spec.parts())
+        and spec.has_position_gain(spec.parts())
     )
     values = np.array([10.0, 20.0, 30.0, 40.0, 100.0])
     moved = placed(spec, values).control
@@ -104,7 +104,7 @@ def test_added_damping_can_be_free():
     ):
         control = {**SMALL["control"], "damping": damping}
         spec = parse_tuning({**SMALL, "control": control, "tune": {"free": free}})
-        assert spec.has_poles(spec.law()) and spec.has_position_gain(spec.law())
+        assert spec.has_poles(spec.parts()) and spec.has_position_gain(spec.parts())
         control = placed(spec, values).control
         np.testing.assert_allclose(control.damping[:, :2], moved, atol=1e-15)
 
@@ -450,9 +450,10 @@ def test_each_law_is_tuned_by_its_own_parameters():
     moved = {family.name: list(family.is_free) for family in spec.families}
     assert moved["own"] == [True, False, False]
     assert moved["lqg"] == [True, True, False] and moved["ppf"] == [True, False, True]
-    assert [spec.law(family) for family in spec.families] == ["lqg", "ppf", "imsc"]
-    assert spec.law() == "imsc" and len(spec.studies("lqg")) == 1
-    assert spec.has_position_gain("ppf") and not spec.has_position_gain("imsc")
+    assert [spec.parts(family).law for family in spec.families] == ["lqg", "ppf", "imsc"]
+    assert spec.parts() == ("imsc", "pd") and len(spec.studies(Parts("lqg", "pd"))) == 1
+    assert spec.has_position_gain(Parts("ppf", "pd"))
+    assert not spec.has_position_gain(spec.parts())
 
 
 @pytest.mark.parametrize(
@@ -484,10 +485,10 @@ def test_designs_of_laws_are_evaluated_in_order():
     found = evaluator.evaluate(spec.free.values(places))
     alone = tuning(GAIN, families={"a": {}, "b": {}}, starts=1)
     wanted = Evaluator(alone, list(alone.moving)).evaluate(alone.free.values(places[[0, 2], :1]))
-    rows = [k for k, family in enumerate(spec.moving) if spec.law(family) == "imsc"]
+    rows = [k for k, family in enumerate(spec.moving) if spec.parts(family).law == "imsc"]
     np.testing.assert_allclose(found.objective[rows], wanted.objective, rtol=1e-9)
     np.testing.assert_allclose(found.slope[rows, 0], wanted.slope[:, 0], rtol=1e-6)
-    push = next(k for k, x in enumerate(spec.moving) if spec.law(x) == "ppf")
+    push = next(k for k, x in enumerate(spec.moving) if spec.parts(x).law == "ppf")
     step = np.array([[0, 1e-4]])
     ahead, back = (
         evaluator.evaluate(spec.free.values(places + sign * step), False) for sign in (1, -1)

@@ -117,8 +117,8 @@ def test_an_unstable_loop_is_the_status_of_what_finished(code):
 
 def test_every_status_has_a_number_and_a_reason():
     codes = {x: n for x, n in vars(status).items() if x.isupper() and isinstance(n, int)}
-    assert sorted(codes.values()) == list(range(24)) == sorted(status.REASONS)
-    assert len(set(status.REASONS.values())) == 24
+    assert sorted(codes.values()) == list(range(25)) == sorted(status.REASONS)
+    assert len(set(status.REASONS.values())) == 25
 
 
 # --- why a run stops ------------------------------------------------------------------------------

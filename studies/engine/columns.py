@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from jaxmodel.loop_figures import MARGINS, MOST_DELAY
 from jaxmodel.metrics import METRICS
 from jaxmodel.prepare import SPECTRUM_SPAN
-from jaxmodel.robustness import MARGINS, MOST_DELAY
 from studies.space.table import CaseTable, as_numbers
 from studies.store import Variable
 from studies.study.labels import DISTANCE_TEXT, STATION_TEXT, STATUS_LABEL

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.case import Case, Structure, uncontrolled, with_ratio
-from jaxmodel.robustness import MARGINS
+from jaxmodel.loop_figures import MARGINS
 from jaxmodel.simulate import Result, simulate
 from studies.engine.poles import PoleReport, pole_report, tracked_modes
 from studies.engine.preflight import check_run

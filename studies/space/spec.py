@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, ValidationError
 
-from jaxmodel.robustness import MARGINS, PEAKS
+from jaxmodel.loop_figures import MARGINS, PEAKS
 from studies.errors import StudyError, field_error, nearest
 from studies.reading import check_depth
 from studies.space.methods import METHODS

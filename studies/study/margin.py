@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from jaxmodel.robustness import MOST_DELAY, MOST_PHASE, guaranteed_range
+from jaxmodel.loop_figures import MOST_DELAY, MOST_PHASE, guaranteed_range
 
 #: Minimum number of plant modes for a margin: uncontrolled modes limit the gains [1].
 MARGIN_MODES = 12

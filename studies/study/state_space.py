@@ -166,7 +166,9 @@ def system_of(section: StateSpaceSection, n_patches: int) -> StateSpace:
         b = np.zeros((0, max(map(len, section.d), default=0)))
     shape = (len(c), b.shape[1])
     d = _sized(section.d, "d", shape) if section.d else np.zeros(shape)
-    tell = _sized(section.anti_windup or ((0.0,) * len(c),) * order, ANTI_WINDUP, (order, len(c)))
+    tell = np.zeros((order, len(c)))
+    if section.anti_windup:
+        tell = _sized(section.anti_windup, ANTI_WINDUP, tell.shape)
     every = 3 * n_patches
     if not section.inputs and not section.outputs and shape == (n_patches, n_patches):
         groups = 3  # the same controller for each link

@@ -23,8 +23,8 @@ from pydantic import ValidationError
 
 from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
+from jaxmodel.loop_figures import MARGINS, PEAKS
 from jaxmodel.metrics import METRICS
-from jaxmodel.robustness import MARGINS, PEAKS
 from studies.engine.preflight import check_run
 from studies.errors import StudyError, field_error, nearest, shown, shown_name
 from studies.space.free import FreeNumbers
