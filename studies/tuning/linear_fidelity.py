@@ -19,9 +19,10 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.frequency_response import response_of_loop
 from jaxmodel.kinematics import singularity_distance
 from jaxmodel.linear_residual import linear_residual
+from jaxmodel.loop_figures import MARGINS, PEAKS
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
-from jaxmodel.robustness import MARGINS, PEAKS, robustness_figures
+from jaxmodel.robustness import robustness_figures
 from jaxmodel.sampled_loop import LoopMatrices, closed_loop, slowest_decay, spillover
 from studies.engine.plan import padded_rows
 from studies.engine.programs import kept_jit
