@@ -11,7 +11,6 @@ import pytest
 from scipy.io import savemat
 
 from jaxmodel.controller import read_back
-from jaxmodel.laws import LAWS
 from jaxmodel.prepare import prepare
 from jaxmodel.state_space import (
     IllConditionedError,
@@ -32,7 +31,6 @@ from studies.export.in_the_loop import replay
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table
 from studies.spillover.certificate import certify
-from studies.spillover.comparison import compare_laws
 from studies.spillover.plants import ModelMismatch
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import load_study, parse_study
@@ -434,4 +432,3 @@ def test_it_is_certified(tmp_path, capsys):
     found = certify(study, bases=("pinned_pinned",), sizes=(3, 6), mismatches=(ModelMismatch(),))
     report = loop_report(*without_run(study), np.array(study.motion.waypoints[0]), n_modes=6)
     assert found.margin[0, 0, 1] == pytest.approx(report.gain_margin, rel=1e-3)
-    assert LAWS["state_space"].text in compare_laws(study, 2.0).names

@@ -16,8 +16,9 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.frequency_response import SampledLoopResponse, response_of_loop
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.imsc import IMSC
+from jaxmodel.loop_figures import MARGINS
 from jaxmodel.prepare import prepare
-from jaxmodel.robustness import MARGINS, robustness_figures
+from jaxmodel.robustness import robustness_figures
 from studies.engine.plan import padded_rows
 from studies.engine.programs import kept_jit
 from studies.engine.stability import with_margin_modes
