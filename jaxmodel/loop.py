@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from jaxmodel import metrics, status
+from jaxmodel.actuation import Acting, act, acting_now
 from jaxmodel.axial import stretch_error
 from jaxmodel.case import Drive, Structure
 from jaxmodel.controller import (
@@ -25,7 +26,7 @@ from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import DriveState, resting_drive
 from jaxmodel.dynamics import Accelerations, accelerations, modal_chain, shortening_row
 from jaxmodel.electronics import Amplifier
-from jaxmodel.hysteresis import Hysteresis, added_voltage, advance_plays
+from jaxmodel.hysteresis import Hysteresis
 from jaxmodel.integrator import Exponential
 from jaxmodel.kinematics import Chain, chain_status, close_chain
 from jaxmodel.lazy import jax, jnp
@@ -252,7 +253,7 @@ def plant_step(
     Returns:
         (state at the end, rates at the start).
     """
-    acting = _acting(loop, state, voltage)
+    acting = act(loop.amplifier, loop.hysteresis, state.voltage, state.plays, voltage)
     volts = acting.course
     h, coefficients = loop.plant_step, loop.exponential
     e, f = coefficients.half, coefficients.half_force
@@ -319,7 +320,7 @@ def plant_step(
 _READS = ((0, 1), (0, 1), (0, 1, 2, 3, 4), (0, 1, 2, 3, 4), (0, 1, 4))
 
 
-def _passed(loop: Loop, state: PlantState, acting: _Acting) -> dict[str, Array]:
+def _passed(loop: Loop, state: PlantState, acting: Acting) -> dict[str, Array]:
     """`direct_z`, `direct_z_rate` and `direct_s` at the end of a step with a held command."""
     if loop.left_out is None or loop.left_out.passage is None:
         return {}
@@ -334,44 +335,6 @@ def _passed(loop: Loop, state: PlantState, acting: _Acting) -> dict[str, Array]:
         for row, name in enumerate(names)
         if before[row] is not None
     }
-
-
-class _Acting(NamedTuple):
-    """How actuators act over a plant step: as if held + remainder exp(-t/lag) were on them."""
-
-    held: Array  # [V], (3, K)
-    remainder: Array | None  # [V], (3, K); None: no amplifiers
-    course: tuple[Array, Array, Array]  # at start, middle and end [V], (3, K) each
-    voltage: Array | None  # on them at the end [V], (3, K); None: no amplifiers
-    plays: Array | None  # of their hysteresis at the end [V], (N, 3, K)
-
-
-def _acting(loop: Loop, state: PlantState, command: Array) -> _Acting:
-    """Actuators behind their amplifiers over a step with a held command.
-
-    The voltage approaches the command without turning. What their plays add over the step follows
-    the same course, also where a play is used up only on the way.
-    """
-    amplifier, before, plays = loop.amplifier, state.voltage, state.plays
-    held, remainder, last = command, None, None
-    if amplifier is not None and before is not None:
-        remainder = before - command
-        last = command + amplifier.left * remainder
-    if loop.hysteresis is not None and plays is not None:
-        after = advance_plays(loop.hysteresis, plays, command if last is None else last)
-        added = added_voltage(loop.hysteresis, after)
-        if amplifier is None or remainder is None:
-            held = command + added
-        else:
-            old = added_voltage(loop.hysteresis, plays)
-            passed = 1 - amplifier.left  # 0 in a step that takes no time
-            change = (added - old) / jnp.where(passed > 0, passed, 1.0)
-            held, remainder = command + old + change, remainder - change
-        plays = after
-    if amplifier is None or remainder is None:
-        return _Acting(held, remainder, (held, held, held), last, plays)
-    start, middle, end = (held + amplifier.course[k] * remainder for k in range(3))
-    return _Acting(held, remainder, (start, middle, end), last, plays)
 
 
 def step(structure: Structure, loop: Loop, state: State, inputs: Inputs) -> tuple[State, Record]:
@@ -447,7 +410,7 @@ def advance(
         )
     reference, chain = _reference(inputs, 0, held), rates.chain
     motors = motor_force(structure, loop.drive, reference, chain.rho, chain.rho_rate)
-    present = _present(loop, plant, voltage)
+    present = acting_now(loop.hysteresis, plant.voltage, plant.plays, voltage)
     sample = _sample(loop, plant, inputs, voltage, present, clipped, motors, rates)
     fixed = metrics.Fixed(loop.omega, loop.modal_omega, loop.rotation, loop.settling_band)
     totals = metrics.accumulate(state.totals, metrics.Instant(sample, inputs.window, fixed))
@@ -472,16 +435,6 @@ def advance(
         drive=_next_drive(structure, loop, state.drive, reference, chain, motors),
     )
     return _freeze_if_bad(structure, loop, state, proposed, chain, inputs), record
-
-
-def _present(loop: Loop, plant: PlantState, command: Array) -> Array:
-    """Voltages by which the actuators act once a command is on them or their amplifiers [V]."""
-    voltage, plays = command if plant.voltage is None else plant.voltage, plant.plays
-    if loop.hysteresis is None or plays is None:
-        return voltage
-    if plant.voltage is None:
-        plays = advance_plays(loop.hysteresis, plays, command)
-    return voltage + added_voltage(loop.hysteresis, plays)
 
 
 def _next_drive(

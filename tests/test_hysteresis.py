@@ -214,6 +214,7 @@ def test_kernel_equals_scan():
         "patches.hysteresis": [0.0, 0.1, 0.2],
         "electronics.voltage_limit": {"from": 0.05, "to": 0.5},
         "electronics.amplifier_hz": [0.0, 2e3],
+        "electronics.delay": [0.0, 1.0, 1.625],
         "drive.kp": {"from": 1e4, "to": 2e4},
     }
     sweep = {"method": "random", "count": 16, "axes": axes}
