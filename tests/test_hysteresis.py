@@ -87,6 +87,7 @@ def test_loop_of_a_full_cycle(width):
 
 run = jax.jit(simulate, static_argnums=(0, 2))
 plant_of = jax.jit(sampled_plant, static_argnums=0)
+prepared = jax.jit(prepare, static_argnums=0)
 
 
 def arrays(study):
@@ -137,7 +138,7 @@ def acting_course(command, lag, share):
     [
         ({}, 1.0, 1e-7),
         # plays that are used up within a step count from its start
-        ({"amplifier_hz": 2e3}, 1.0, 4e-4),
+        pytest.param({"amplifier_hz": 2e3}, 1.0, 4e-4, marks=pytest.mark.long),
         ({"amplifier_hz": 2e3, "delay": 1.375}, 0.375, 4e-4),
     ],
     ids=["plain", "amplifier", "amplifier, delay"],
@@ -167,7 +168,7 @@ def test_run_is_that_of_the_plant_behind_operators(electronics, share, within):
             z[-9:] = held
     q, found = np.array(q), record.modal_coordinate[:-1].reshape(len(q), -1)
     np.testing.assert_allclose(found, q, rtol=0, atol=within * np.abs(q).max())
-    controller = prepare(structure, case).loop.controller
+    controller = prepared(structure, case).loop.controller
 
     def sample(before, voltage):
         after, _ = controller_step(controller, before, voltage, None, True)
