@@ -37,6 +37,7 @@ class Structure(NamedTuple):
     has_amplifier: bool = False  # actuators behind amplifiers of finite bandwidth
     has_delay: bool = False  # commands arrive later or earlier than after one sample
     has_notch: bool = False  # notch filters before the feedback
+    has_hysteresis: bool = False  # of the actuators, near their voltage limit
     has_noise: bool = False  # seeded ADC noise and force ripple
     has_friction: bool = False  # Coulomb friction on the sliders
     has_poles: bool = False  # gains follow from poles

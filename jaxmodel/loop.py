@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from jaxmodel import metrics, status
+from jaxmodel.actuation import Acting, act, acting_now
 from jaxmodel.axial import stretch_error
 from jaxmodel.case import Drive, Structure
 from jaxmodel.controller import (
@@ -25,6 +26,7 @@ from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import DriveState, resting_drive
 from jaxmodel.dynamics import Accelerations, accelerations, modal_chain, shortening_row
 from jaxmodel.electronics import Amplifier
+from jaxmodel.hysteresis import Hysteresis
 from jaxmodel.integrator import Exponential
 from jaxmodel.kinematics import Chain, chain_status, close_chain
 from jaxmodel.lazy import jax, jnp
@@ -58,6 +60,7 @@ class Loop(NamedTuple):
     left_out: LeftOut | None  # static response of the modes left out; None: truncated model
     settling_band: Array  # [m], ()
     delayed: Delayed | None = None  # None: commands are held from sample to sample, one later
+    hysteresis: Hysteresis | None = None  # of the actuators; None: they are linear
     rest: Rest | None = None  # about which the linear model is taken; None: the full model
 
 
@@ -108,6 +111,7 @@ class PlantState(NamedTuple):
     direct_z_rate: Array | None = None  # [V/s], (3, K)
     direct_s: Array | None = None  # drained by the amplifiers' inputs [V], (3, K)
     commands: Array | None = None  # on their way, u_(k-2), u_(k-3), .. [V], (J - 2, 3, K)
+    plays: Array | None = None  # of the actuators' hysteresis [V], (N, 3, K)
 
 
 class State(NamedTuple):
@@ -249,7 +253,8 @@ def plant_step(
     Returns:
         (state at the end, rates at the start).
     """
-    volts, last_voltage = _amplified(loop.amplifier, state.voltage, voltage)
+    acting = act(loop.amplifier, loop.hysteresis, state.voltage, state.plays, voltage)
+    volts = acting.course
     h, coefficients = loop.plant_step, loop.exponential
     e, f = coefficients.half, coefficients.half_force
     start, middle, end = references
@@ -303,9 +308,10 @@ def plant_step(
         z=mode(2),
         z_rate=mode(3),
         s=mode(4),
-        voltage=last_voltage,
+        voltage=acting.voltage,
         commands=state.commands,
-        **_passed(loop, state, voltage),
+        plays=acting.plays,
+        **_passed(loop, state, acting),
     )
     return after, first
 
@@ -314,34 +320,21 @@ def plant_step(
 _READS = ((0, 1), (0, 1), (0, 1, 2, 3, 4), (0, 1, 2, 3, 4), (0, 1, 4))
 
 
-def _passed(loop: Loop, state: PlantState, command: Array) -> dict[str, Array]:
+def _passed(loop: Loop, state: PlantState, acting: Acting) -> dict[str, Array]:
     """`direct_z`, `direct_z_rate` and `direct_s` at the end of a step with a held command."""
     if loop.left_out is None or loop.left_out.passage is None:
         return {}
     assert state.direct_z is not None and state.direct_z_rate is not None
-    remainder = None if state.voltage is None else state.voltage - command
-    before = (state.direct_z, state.direct_z_rate, state.direct_s, remainder, command)
+    before = (state.direct_z, state.direct_z_rate, state.direct_s, acting.remainder, acting.held)
     passage, names = loop.left_out.passage, ("direct_z", "direct_z_rate", "direct_s")
     return {
         name: sum(
             (passage[row, k] * x for k, x in enumerate(before) if x is not None),
-            start=jnp.zeros_like(command),
+            start=jnp.zeros_like(acting.held),
         )
         for row, name in enumerate(names)
         if before[row] is not None
     }
-
-
-def _amplified(
-    amplifier: Amplifier | None, before: Array | None, command: Array
-) -> tuple[tuple[Array, Array, Array], Array | None]:
-    """Voltages [V] on the actuators at start, middle and end of a step, and the remainder."""
-    if amplifier is None or before is None:
-        return (command, command, command), None
-    change = before - command
-    course = amplifier.course
-    start, middle, end = (command + course[k] * change for k in range(3))
-    return (start, middle, end), command + amplifier.left * change
 
 
 def step(structure: Structure, loop: Loop, state: State, inputs: Inputs) -> tuple[State, Record]:
@@ -417,7 +410,7 @@ def advance(
         )
     reference, chain = _reference(inputs, 0, held), rates.chain
     motors = motor_force(structure, loop.drive, reference, chain.rho, chain.rho_rate)
-    present = voltage if plant.voltage is None else plant.voltage
+    present = acting_now(loop.hysteresis, plant.voltage, plant.plays, voltage)
     sample = _sample(loop, plant, inputs, voltage, present, clipped, motors, rates)
     fixed = metrics.Fixed(loop.omega, loop.modal_omega, loop.rotation, loop.settling_band)
     totals = metrics.accumulate(state.totals, metrics.Instant(sample, inputs.window, fixed))
@@ -684,6 +677,7 @@ def initial_state(
             direct_z_rate=jnp.zeros_like(controller.voltage) if is_direct else None,
             direct_s=jnp.zeros_like(controller.voltage) if is_direct and is_drained else None,
             commands=None if loop.delayed is None else _on_their_way(loop.delayed, controller),
+            plays=None if loop.hysteresis is None else _no_plays(loop.hysteresis, controller),
         ),
         controller=controller,
         totals=totals,
@@ -696,3 +690,8 @@ def initial_state(
 def _on_their_way(delayed: Delayed, controller: ControllerState) -> Array:
     """Commands before the start, all zero [V], (J - 2, 3, K)."""
     return jnp.stack([jnp.zeros_like(controller.voltage)] * (delayed.before.shape[0] - 2))
+
+
+def _no_plays(hysteresis: Hysteresis, controller: ControllerState) -> Array:
+    """Actuators that nothing has driven before [V], (N, 3, K)."""
+    return jnp.stack([jnp.zeros_like(controller.voltage)] * hysteresis.play.shape[0])

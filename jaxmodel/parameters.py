@@ -76,6 +76,7 @@ class Patches(NamedTuple):
     gauge_factor: Array = 2.1  # relative change of resistance over strain [1]
     bridge: Array = 2500.0  # amplified bridge voltage per relative change of resistance [V]
     gauge_noise: Array = 0.0  # of the bridge's amplifier, rms [V]
+    hysteresis: Array = 0.0  # width of the actuators' loop, see `jaxmodel.hysteresis` [1], ()
 
 
 class Damping(NamedTuple):

@@ -20,6 +20,7 @@ from jaxmodel.drives.contract import drive_gains
 from jaxmodel.dynamics import inverse_dynamics
 from jaxmodel.electronics import Amplifier, design_amplifier, voltage_passage
 from jaxmodel.estimator import KINDS
+from jaxmodel.hysteresis import Hysteresis, design_hysteresis
 from jaxmodel.integrator import Exponential, exponential_step
 from jaxmodel.kinematics import close_chain
 from jaxmodel.laws import LAWS, is_modal, n_channels
@@ -114,6 +115,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         axial_compliance=axial_compliance(machine.beam),
         settling_band=jnp.asarray(case.windows.settling_band),
         left_out=_left_out(structure, case, basis, after),
+        hysteresis=_hysteresis(structure, case),
         rest=_rest(structure, case, plant) if structure.is_linear else None,
     )
     if change is not None:
@@ -155,6 +157,12 @@ def _amplifier(structure: Structure, case: Case, step: Array) -> Amplifier | Non
     if not structure.has_amplifier:
         return None
     return design_amplifier(step, case.electronics.amplifier_lag)
+
+
+def _hysteresis(structure: Structure, case: Case) -> Hysteresis | None:
+    if not structure.has_hysteresis or structure.feedback != "sampled":
+        return None
+    return design_hysteresis(case.machine.patches.hysteresis, case.electronics.voltage_limit)
 
 
 def _passage(structure: Structure, case: Case, step: Array) -> Array | None:

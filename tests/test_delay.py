@@ -16,15 +16,25 @@ from jaxmodel.prepare import prepare
 from jaxmodel.return_difference import delayed
 from jaxmodel.sampled_loop import closed_loop, sampled_plant
 from jaxmodel.simulate import simulate
+from studies.engine.stability import loop_report
+from studies.spillover.certificate import certify
+from studies.spillover.plants import ModelMismatch
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import paper_study, parse_study
+from studies.tuning.optimise import optimise
+from studies.tuning.run import make_evaluator
+from studies.tuning.spec import parse_tuning
 from tests.sweeps import small_spec
 from tests.test_kernel import both, check_equal
 from tests.test_margins import assert_return_difference
+from tests.test_notch import NOTCHES
 from tests.test_onset import BASE, HOME, LIMIT
+from tests.tunings import GAIN, SMALL
 
 POSE = np.array(HOME)
 ELECTRONICS = {"sensor_highpass_hz": 5.0, "amplifier_hz": 2e3}
+#: Without electronics each kind of check is a program of its own, and their special case.
+KINDS = [pytest.param({}, marks=pytest.mark.long), ELECTRONICS]
 DELAYS = (0.0, 0.125, 1.0, 2.625, 4.0)
 
 
@@ -35,7 +45,7 @@ def arrays(study):
 def small(delay, unmodelled=0.0, electronics=None, **sections):
     own = {**BASE["electronics"], **(electronics or {})}
     own |= {"delay": delay, "unmodelled_delay": unmodelled}
-    return parse_study({**BASE, **sections, "electronics": own})
+    return parse_study({**BASE, "link": {"modes": 2}, **sections, "electronics": own})
 
 
 @pytest.mark.parametrize(
@@ -69,7 +79,7 @@ def test_controller_knows_its_own_delay_only():
 plant_of = jax.jit(sampled_plant, static_argnums=0)
 
 
-@pytest.mark.parametrize("electronics", [{}, ELECTRONICS], ids=["plain", "amplifier, high-pass"])
+@pytest.mark.parametrize("electronics", KINDS, ids=["plain", "amplifier, high-pass"])
 @pytest.mark.parametrize("delay", [0.0, 0.375, 2.625, 4.0])
 def test_sampled_plant_is_that_of_a_queue_at_eight_times_the_rate(delay, electronics):
     """At 80 kHz, whole samples of delay, commands held for eight of them, by brute force."""
@@ -96,9 +106,12 @@ def test_sampled_plant_is_that_of_a_queue_at_eight_times_the_rate(delay, electro
 
 @pytest.mark.parametrize("delay", [0.5, 2.625])
 def test_return_difference_is_that_of_the_matrices(delay):
-    points = ((3.0, 1.0), (114.4, 1.0), (722.0, 1.0), (4400.0, 0.5))
+    """With notch filters of the links, too."""
+    points = ((3.0, 1.0), (114.4, 1.0), (722.0, 1.0), (1830.0, 2.0), (4400.0, 0.5))
     study = paper_study().change(
-        electronics__delay=delay, **{f"electronics__{x}": y for x, y in ELECTRONICS.items()}
+        electronics__delay=delay,
+        **{f"electronics__{x}": y for x, y in ELECTRONICS.items()},
+        **{f"control__{x}": y for x, y in NOTCHES.items()},
     )
     assert_return_difference(study, points)
 
@@ -113,7 +126,7 @@ def voltages(study):
     return np.asarray(found.record.actuator_voltage), structure, case
 
 
-@pytest.mark.parametrize("electronics", [{}, ELECTRONICS], ids=["plain", "amplifier, high-pass"])
+@pytest.mark.parametrize("electronics", KINDS, ids=["plain", "amplifier, high-pass"])
 @pytest.mark.parametrize("delay", DELAYS)
 def test_run_is_that_of_the_matrices(delay, electronics):
     """Deflections so small that the machine is linear, without rounding."""
@@ -166,13 +179,17 @@ def test_poles_are_placed_on_the_loop_with_its_delay(law, delay):
 
 
 def test_kernel_equals_scan():
+    """With notch filters of the links, too."""
     axes = {
+        "control.notch_hz[0]": [0.0, 1500.0, 1900.0],
+        "control.notch_depth[2]": {"from": 0.0, "to": 0.5},
         "electronics.delay": {"from": 0.0, "to": 2.0},
         "electronics.unmodelled_delay": [0.0, 0.25, 1.5],
         "drive.kp": {"from": 1e4, "to": 2e4},
     }
     sweep = {"method": "random", "count": 16, "axes": axes}
-    fast, reference = both(small_spec(sweep, link={"modes": 2}, electronics=ELECTRONICS))
+    sections = {"link": {"modes": 2}, "electronics": ELECTRONICS, "control": NOTCHES}
+    fast, reference = both(small_spec(sweep, **sections))
     assert np.sum(reference.status == status.OK) >= 8
     check_equal(fast, reference)
 
@@ -192,10 +209,12 @@ def assert_slope(function, step=1e-3):
     np.testing.assert_allclose(slope, wanted, rtol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["delay", "unmodelled_delay"])
+@pytest.mark.parametrize(
+    "name", ["delay", pytest.param("unmodelled_delay", marks=pytest.mark.long)]
+)
 def test_derivative_of_the_matrices_by_the_delay(name):
     """Of the machine, and of what the controller designs for the delay that it knows."""
-    structure, case = arrays(small(1.5, -0.5, link={"modes": 2}))
+    structure, case = arrays(small(1.5, -0.5))
 
     def loop(by):
         matrices = closed_loop(structure, changed(case, name, by), POSE)
@@ -211,7 +230,6 @@ def test_derivative_of_a_run_by_the_delay(delay):
     study = small(
         1.5,
         delay - 1.5,
-        link={"modes": 2},
         run={"duration": 0.01, "smooth": True},
         metrics={"residual_delay": 0.0, "residual_length": 0.005},
     )
@@ -246,11 +264,17 @@ def _record(structure, case):
     return simulate(structure, case, has_record=True).record.actuator_voltage
 
 
-@pytest.mark.parametrize("law", ["imsc", pytest.param("lqg", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("law", ["imsc", "lqg"])
 def test_runs_grow_beyond_the_delay_at_which_eigenvalues_leave_the_circle(law):
     """The extra delay that the loop bears, by bisection on its matrices, within 5 %."""
     structure, case = arrays(
-        small(1.0, 0.1, control={"law": law, "gain_factor": STRONG[law]}, initial=DEFLECTED)
+        small(
+            1.0,
+            0.1,
+            control={"law": law, "gain_factor": STRONG[law]},
+            initial=DEFLECTED,
+        )
     )
 
     @jax.jit
@@ -272,3 +296,41 @@ def test_runs_grow_beyond_the_delay_at_which_eigenvalues_leave_the_circle(law):
 #: Gains with which the delay that a loop bears is a sample or so.
 STRONG = {"imsc": 3.0, "lqg": 1.0}
 DEFLECTED = {"load_deflection": (1e-5, 1e-5, -1e-5)}
+
+
+def test_a_design_is_tuned_at_its_delay():
+    """Downhill, by derivatives that are those of differences, and not as at another delay."""
+    evaluators, at = [], []
+    for delay in (1.5, 1.25):
+        spec = parse_tuning(
+            {
+                **SMALL,
+                "run": {"duration": 0.05},
+                "electronics": {"delay": delay},
+                "tune": {"free": GAIN, "objective": {"residual_rms": 1.0}, **TINY},
+            }
+        )
+        evaluators.append(make_evaluator(spec))
+        at.append(evaluators[-1].evaluate(np.array([[0.4]])))
+    assert abs(at[1].objective[0] / at[0].objective[0] - 1) > 1e-3
+    after, before = (
+        evaluators[1].evaluate(np.array([[gain]])).objective[0] for gain in (0.4004, 0.3996)
+    )
+    assert at[1].slope[0, 0] == pytest.approx((after - before) / 8e-4, rel=1e-4)
+    end = optimise(spec, evaluators[1], None, lambda progress: None)
+    assert end.best_objective[end.winner(0)] < 0.97
+
+
+#: The least that a tuning does.
+TINY = {"limits": {}, "starts": 1, "iterations": 3}
+
+
+def test_a_certificate_judges_the_loop_with_its_delay():
+    study = paper_study().change(link__modes=3, electronics__delay=1.5)
+    found = certify(study, sizes=(3,), bases=("pinned_pinned",), mismatches=(ModelMismatch(),))
+    pose = np.array(study.motion.waypoints[0])
+    report = loop_report(*arrays(study), pose, n_modes=3)
+    np.testing.assert_allclose(found.margin[0, 0, 0], report.gain_margin, rtol=2e-4)
+    np.testing.assert_allclose(found.radius[0, 0, 0], report.spectral_radius, rtol=1e-9)
+    other = loop_report(*arrays(study.change(electronics__delay=1.25)), pose, n_modes=3)
+    assert abs(other.gain_margin / report.gain_margin - 1) > 0.02

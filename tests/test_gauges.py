@@ -1,6 +1,7 @@
 """Strain gauges in place of piezo sensors."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
@@ -9,6 +10,7 @@ from jaxmodel import status
 from jaxmodel.piezo import actuator_constant, sensor_constant
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import closed_loop, sampled_plant
+from jaxmodel.simulate import simulate
 from jaxmodel.static import link_pieces, section_stiffness
 from studies.errors import StudyError
 from studies.study.cases import as_arrays, build_case, build_structure
@@ -19,6 +21,7 @@ from tests.test_kernel import both, check_equal
 from tests.test_onset import BASE, HOME
 
 POSE = np.array(HOME)
+prepared = jax.jit(prepare, static_argnums=0)
 GAUGES = {
     "sensor": "strain_gauge",
     "gauge_factor": 2.0,
@@ -60,7 +63,7 @@ def test_voltage_is_that_of_the_bridge():
     """Mean strain of mode 1 by quadrature, and a half bridge of resistors by Kirchhoff."""
     structure, case = arrays(**GAUGES)
     beam, patches = one_link(case)
-    loop = prepare(structure, case).loop
+    loop = prepared(structure, case).loop
     left, length, q = 0.05 - 0.005, 0.2, 1e-5
     curvature = scipy.integrate.quad(
         lambda x: q * (np.pi / length) ** 2 * np.sin(np.pi * x / length), left, left + 0.01
@@ -118,10 +121,10 @@ def test_noise_of_the_bridge_adds_to_that_of_the_converter():
     )
     structure, case = build_structure(study), as_arrays(build_case(study))
     assert structure.has_noise
-    noise = float(prepare(structure, case).loop.controller.adc_noise)
+    noise = float(prepared(structure, case).loop.controller.adc_noise)
     assert noise == pytest.approx(np.hypot(0.1 * 0.03, 0.004), rel=1e-12)
     piezo = as_arrays(build_case(study.change(patches__sensor="piezo")))
-    assert float(prepare(structure, piezo).loop.controller.adc_noise) == 0.004
+    assert float(prepared(structure, piezo).loop.controller.adc_noise) == 0.004
 
 
 def test_kernel_equals_scan_over_both_kinds():
@@ -147,3 +150,33 @@ def test_verification_of_the_links_knows_gauges(basis):
     study = parse_study({**BASE, "patches": GAUGES, "link": {"modes": 3, "basis": basis}})
     for row in check_links(study):
         assert row.left_out or row.difference <= row.allowed, row
+
+
+def test_slopes_of_a_run_are_those_of_differences():
+    """Of residual vibration, by the gauges' length and noise."""
+    study = parse_study(
+        {
+            **BASE,
+            "link": {"modes": 2},
+            "run": {"duration": 0.01, "smooth": True},
+            "metrics": {"residual_delay": 0.0, "residual_length": 0.005},
+            "patches": {**GAUGES, "gauge_noise": 0.02},
+        }
+    )
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    structure = structure._replace(metrics=("residual_rms",))
+
+    def residual(shares):
+        patches = case.machine.patches
+        patches = patches._replace(
+            sensor_length=patches.sensor_length * (1 + shares[0]),
+            gauge_noise=patches.gauge_noise * (1 + shares[1]),
+        )
+        machine = case.machine._replace(patches=patches)
+        result = simulate(structure, case._replace(machine=machine))
+        return 1e6 * jnp.sum(result.metrics.residual_rms)
+
+    slope = np.asarray(jax.jit(jax.jacfwd(residual))(np.zeros(2)))
+    function, step = jax.jit(residual), 1e-4
+    wanted = [(function(by) - function(-by)) / (2 * step) for by in step * np.eye(2)]
+    np.testing.assert_allclose(slope, wanted, rtol=1e-4)

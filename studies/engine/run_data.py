@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy
 
@@ -12,6 +14,7 @@ from jaxmodel.bases import find_bases
 from jaxmodel.beam import build_basis
 from jaxmodel.case import Case, Structure
 from jaxmodel.delay import command_change, true_delay
+from jaxmodel.hysteresis import added_voltage, advance_plays, design_hysteresis
 from jaxmodel.metrics import METRICS
 from jaxmodel.prepare import left_out_deflection, spectrum_frequencies
 from jaxmodel.simulate import Result
@@ -170,7 +173,7 @@ def chord_deflection(run: Run) -> np.ndarray:
     assert record is not None
     bent = np.einsum("tir,ir->ti", record.modal_coordinate, per_mode[:, 0])
     if run.structure.has_static_correction:
-        bent = bent + np.einsum("tik,ik->ti", _applied_voltage(run), per_volt[:, 0])
+        bent = bent + np.einsum("tik,ik->ti", _acting_voltage(run), per_volt[:, 0])
     return bent
 
 
@@ -182,21 +185,40 @@ def _deflections_at(structure: Structure, case: Case, places: np.ndarray) -> tup
     return shape.deflection_at, left_out_deflection(case, shape)
 
 
-def _applied_voltage(run: Run) -> np.ndarray:
-    """Behind the amplifiers, at the sampling instants [V], (n_steps, 3, K)."""
+def _acting_voltage(run: Run) -> np.ndarray:
+    """By which the actuators act, behind their amplifiers, at the samples [V], (n_steps, 3, K)."""
     assert run.result.record is not None
     command = np.asarray(run.result.record.actuator_voltage)
     if not run.structure.has_amplifier:
-        return command
+        return command + _added_voltage(run, command[:, None])[:, 0]
     electronics = run.case.electronics
     # of a sample, the share until its command changes to that of the next one
     share = 1.0
     if run.structure.is_delayed:
         share = float(command_change(true_delay(electronics)).share) or 1.0
-    kept, later = (
-        np.exp(-x * electronics.period / electronics.amplifier_lag) for x in (1.0, 1 - share)
+    kept, later, until = (
+        np.exp(-x * electronics.period / electronics.amplifier_lag) for x in (1.0, 1 - share, share)
     )
-    return scipy.signal.lfilter([1 - later, later - kept], [1.0, -kept], command, axis=0)
+    voltage = scipy.signal.lfilter([1 - later, later - kept], [1.0, -kept], command, axis=0)
+    at_change = command + until * (voltage - command)
+    return voltage + _added_voltage(run, np.stack([voltage, at_change], axis=1))[:, 0]
+
+
+def _added_voltage(run: Run, voltage: np.ndarray) -> np.ndarray:
+    """What hysteresis adds to voltages between which they do not turn [V], (n_steps, n, 3, K)."""
+    if run.structure.feedback != "sampled" or not run.structure.has_hysteresis:
+        return np.zeros_like(voltage)
+    width, limit = run.case.machine.patches.hysteresis, run.case.electronics.voltage_limit
+    operators = design_hysteresis(width, limit)
+    n_links, n_patches = voltage.shape[2:]
+
+    def move(plays: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
+        after = advance_plays(operators, plays, v)
+        return after, added_voltage(operators, after)
+
+    start = jnp.zeros((len(operators.play), n_links, n_patches))
+    _, added = jax.lax.scan(move, start, jnp.reshape(voltage, (-1, n_links, n_patches)))
+    return np.asarray(added).reshape(voltage.shape)
 
 
 def run_attributes(study: Study) -> dict[str, Any]:

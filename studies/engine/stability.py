@@ -81,6 +81,7 @@ def with_margin_modes(
         is_linear=False,
         n_frequencies=1,
         has_noise=False,
+        has_hysteresis=False,
         metrics=(),
         is_smooth=True,
         feedback="sampled",

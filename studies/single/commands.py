@@ -153,7 +153,13 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
     from studies.show.listing import print_rows
     from studies.single.summary import limits_text, link_rows
     from studies.study.labels import describe, remedy
-    from studies.study.margin import MARGIN_MODES, caution, margin_in_db, robustness_text
+    from studies.study.margin import (
+        MARGIN_MODES,
+        caution,
+        hysteresis_text,
+        margin_in_db,
+        robustness_text,
+    )
     from studies.study.spec import AUTO
 
     windows = run.case.windows
@@ -171,6 +177,8 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
         + (", when the slider drive has settled to 2 %" if settled else ""),
         soft_wrap=True,
     )
+    if text := hysteresis_text(run.study.patches.hysteresis):
+        console.print(text, soft_wrap=True)
     if run.loop is None:
         return
     damping = ", ".join(f"{zeta:.3g}" for zeta in run.loop.damping_ratio.min(axis=1))

@@ -22,7 +22,7 @@ from studies.show.sketch import CAPTION
 from studies.show.units import is_cut_off, number
 from studies.show.words import control_text, motion_text
 from studies.single.summary import limits_text, link_rows, settling_text, watched
-from studies.study.margin import ENOUGH, MARGIN_MODES, caution
+from studies.study.margin import ENOUGH, MARGIN_MODES, caution, hysteresis_text
 
 #: Figures, by the end of the file name.
 #: What a run means, by its situation.
@@ -87,6 +87,7 @@ def report(
         verdict=VERDICTS,
         caution=caution(run.loop.gain_margin) if run.loop is not None else "",
         at_limit=limits_text(run),
+        hysteresis=hysteresis_text(study.patches.hysteresis),
         case=_situation(run, twin),
         band=study.metrics.settling_band,
         windows=run.case.windows,

@@ -27,6 +27,7 @@ from studies.spillover.plants import (
 )
 from studies.spillover.proofs import Proofs
 from studies.study.consistency import each_link
+from studies.study.margin import hysteresis_text
 from studies.study.spec import Study
 
 #: Gain factors at which modes are traced from no control to the design's gains.
@@ -253,6 +254,8 @@ def _certificate(
         gains = builder.spillover_gains(plant, law)
         observation[at] = gains.observation[:, :channels]
         actuation[at] = gains.actuation[:, :, :channels]
+    width = design.study.patches.hysteresis
+    left_out = [f"left out: {fault}" for fault in faults.ravel() if fault]
     return Certificate(
         study=design.study,
         required=margin,
@@ -268,5 +271,5 @@ def _certificate(
         breaking=breaking.astype(str),
         observation=observation,
         actuation=actuation,
-        notes=tuple(dict.fromkeys(f"left out: {fault}" for fault in faults.ravel() if fault)),
+        notes=tuple(filter(None, dict.fromkeys([hysteresis_text(width), *left_out]))),
     )

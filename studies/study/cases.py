@@ -45,6 +45,7 @@ SWITCHES = {
     "has_amplifier": ("electronics.amplifier_hz",),
     "has_delay": ("electronics.delay", "electronics.unmodelled_delay"),
     "has_notch": ("control.notch_hz",),
+    "has_hysteresis": ("patches.hysteresis",),
     "has_noise": ("electronics.adc_noise", "drive.ripple", "patches.gauge_noise"),
     "has_friction": ("drive.coulomb_friction",),
     "has_poles": ("control.damping", "control.pole_decay"),
@@ -225,6 +226,7 @@ def _machine(numbers: Numbers, structure: Structure, xp: Any) -> Machine:
             gauge_factor=number("patches.gauge_factor"),
             bridge=_bridge(numbers),
             gauge_noise=number("patches.gauge_noise"),
+            hysteresis=number("patches.hysteresis"),
         ),
         damping=_damping(numbers, xp),
     )

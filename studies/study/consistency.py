@@ -212,6 +212,10 @@ def _check_patches(study: Study) -> None:
         raise field_error(
             "electronics.sensor_highpass_hz", drain, "0 where patches.sensor = 'strain_gauge'", "Hz"
         )
+    if patches.hysteresis > 0 and study.control.feedback == "ideal":
+        raise field_error(
+            "patches.hysteresis", patches.hysteresis, "0 where control.feedback = 'ideal'", "1"
+        )
     widths = each_link(patches.width)
     for i in np.flatnonzero(widths > each_link(link.width) * (1 + 1e-9))[:1]:
         raise field_error(

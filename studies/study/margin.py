@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from jaxmodel.hysteresis import PLAYS, slope_at_limit
 from jaxmodel.loop_figures import MOST_DELAY, MOST_PHASE, guaranteed_range
 
 #: Minimum number of plant modes for a margin: uncontrolled modes limit the gains [1].
@@ -37,6 +38,21 @@ def caution(margin: float) -> str:
             f"CAUTION: a gain margin of {margin:.3g}; below {ENOUGH:g} a machine may go unstable."
         )
     return ""
+
+
+def hysteresis_text(width: float) -> str:
+    """What hysteresis of the actuators means for margins, "" without.
+
+    Args:
+        width: `patches.hysteresis` [1].
+    """
+    if width == 0:
+        return ""
+    return (
+        f"Actuators have hysteresis (patches.hysteresis = {width:g}): margins and certificates are "
+        f"those of signals below {PLAYS[0]:g} of electronics.voltage_limit; up to that limit the "
+        f"same volts push up to {slope_at_limit(width):.3g} times as hard."
+    )
 
 
 def margin_text(value: float, digits: int = 4) -> str:

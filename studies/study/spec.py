@@ -17,6 +17,7 @@ from jaxmodel.delay import LONGEST
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import DriveLaw
 from jaxmodel.estimator import KINDS
+from jaxmodel.hysteresis import WIDEST
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law
 from jaxmodel.motion import PROFILES
@@ -255,6 +256,15 @@ class PatchesSection(Section):
     gauge_arms: int = described(2, "1", "active arms of a bridge's four", ge=1, le=4)
     gauge_gain: float = described(1000.0, "1", "of the bridges' amplifiers", gt=0, le=1e6)
     gauge_noise: float = described(0.0, "V", "rms behind these amplifiers", ge=0, le=10)
+    hysteresis: float = described(
+        0.0,
+        "1",
+        "of the actuators: widest opening of force over voltage in cycles of +-voltage_limit, over "
+        "the range of the force; soft PZT 0.1 to 0.15, 0: none",
+        ge=0,
+        le=WIDEST,
+        free=MACHINE,
+    )
 
 
 class MotionSection(Section):

@@ -97,6 +97,9 @@ def check_supported(study: Study) -> None:
     if build_structure(study).has_delay:
         delay = study.electronics.delay + study.electronics.unmodelled_delay
         raise field_error("electronics.delay", delay, "1 for studies twin", "samples")
+    if study.patches.hysteresis > 0:
+        hysteresis = study.patches.hysteresis
+        raise field_error("patches.hysteresis", hysteresis, "0 for studies twin", "1")
     if not BASES[link.basis].is_on_chord:
         names = ", ".join(name for name, one in BASES.items() if one.is_on_chord)
         raise field_error("link.basis", link.basis, f"{names} for studies twin")
