@@ -15,8 +15,11 @@ from studies.engine.diagonal_scaling import balanced, best_scaling, largest_sing
 from studies.engine.loop_gain import LoopGains
 from studies.engine.margin_grid import GridGain, excess
 
+#: Where L vanishes.
+LARGEST = 2.0
 #: Local maxima that are followed, and points of a zoom.
 FOLLOWED, POINTS = 5, 7
+
 
 def disk_margins(loops: LoopGains, grid: GridGain) -> np.ndarray:
     """alpha [1], 0 to 2, of stable loops, (n,).
@@ -40,7 +43,7 @@ def disk_margins(loops: LoopGains, grid: GridGain) -> np.ndarray:
         if len(rows):
             found = _peaks(loops.part(rows), bracket[rows, order[rows, turn]])
             best[rows] = np.maximum(best[rows], found)
-    return 1 / best
+    return np.minimum(1 / best, LARGEST)
 
 
 def _peaks(loops: LoopGains, bracket: np.ndarray) -> np.ndarray:

@@ -78,10 +78,9 @@ class LoopGains(NamedTuple):
         delay = np.zeros(omega.shape) if delay is None else delay
         return self._gains(omega, delay, is_exact=True)
 
-    def at_delays(self, omega: np.ndarray, delays: np.ndarray) -> np.ndarray:
-        """L to 1e-4 with further delays [samples], (D, n, F, m, m)."""
-        shape = omega.shape
-        return np.stack([self._gains(omega, np.full(shape, x), is_exact=False) for x in delays])
+    def at_delay(self, omega: np.ndarray, delay: np.ndarray) -> np.ndarray:
+        """L to 1e-4 with further delays, arguments as for `exact`."""
+        return self._gains(omega, delay, is_exact=False)
 
     def _gains(self, omega: np.ndarray, delay: np.ndarray, is_exact: bool) -> np.ndarray:
         order = _ALL if is_exact else _FEW
@@ -122,9 +121,7 @@ class LoopGains(NamedTuple):
         # the sum over images and pose is one product
         left = leaving.transpose(0, 1, 3, 2, 4).reshape(n, -1, 3 * k, 3 * images)
         sensed = left @ entering[..., self.acting].reshape(n, -1, 3 * images, len(self.acting))
-        own = gain[:, None, :, None, None] * (
-            blocks[..., :k, :k] + plant.direct[:, :, None]
-        )
+        own = gain[:, None, :, None, None] * (blocks[..., :k, :k] + plant.direct[:, :, None])
         own = own.reshape(n, 3, -1, images, k, k).sum(axis=3)
         whole = np.zeros((*sensed.shape[:3], 3 * k), complex)
         for i in range(3):
