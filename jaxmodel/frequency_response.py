@@ -388,15 +388,6 @@ def command_gain(response: SampledLoopResponse, omega: Array, delay: Array | Non
     return -controller_response(response.controller, jnp.exp(1j * omega * plant.period)) @ sensed
 
 
-def command_gain_images(response: SampledLoopResponse, omega: Array) -> Array:
-    """Parts of L by the first images, -`FEW`.. `FEW`; their sum lacks 1e-4, (I, 3 K, 3 K)."""
-    plant, order = response.plant, np.arange(-FEW, FEW + 1)
-    sensed = plant_images(plant, omega, order).sensed
-    turned = jnp.exp(-1j * (omega * plant.period + 2 * np.pi * order) * plant.late)
-    gain = controller_response(response.controller, jnp.exp(1j * omega * plant.period))
-    return -gain @ sensed * turned[:, None, None]
-
-
 class ClosedLoop(NamedTuple):
     """Responses of the closed loop, complex."""
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxmodel.robustness import MOST_DELAY, MOST_PHASE
+from jaxmodel.robustness import MOST_DELAY, MOST_PHASE, MarginPlace
 from studies.engine.loop_gain import LoopGains
 from studies.engine.margin_grid import GridGain
 
@@ -52,8 +52,8 @@ def _joined(parts: list[_Places]) -> _Places:
     return _Places(*(np.concatenate(x) for x in zip(*parts, strict=True)))
 
 
-def phase_margins(loops: LoopGains, grid: GridGain) -> np.ndarray:
-    """Smallest common phase of all commands that makes a stable loop unstable [deg], (n,)."""
+def phase_margins(loops: LoopGains, grid: GridGain) -> MarginPlace:
+    """Smallest common phase of all commands that makes stable loops unstable [deg], (n,) each."""
     columns = _columns(grid.radius >= STRONG)
     gain = np.take_along_axis(grid.gain, columns[..., None, None], axis=1)
     omega = np.take_along_axis(grid.omega, columns, axis=1)
@@ -67,12 +67,12 @@ def phase_margins(loops: LoopGains, grid: GridGain) -> np.ndarray:
         found = np.linalg.eigvals(loops.part(places.loop[rows]).exact(omega[:, None])[:, 0])
         return found * turned
 
-    solved = _smallest(places, np.abs(places.log.imag), -1j * sign, eigenvalues, len(omega))
-    return np.minimum(np.rad2deg(solved), MOST_PHASE)
+    found = _smallest(places, np.abs(places.log.imag), sign, -1j * sign, eigenvalues, len(omega))
+    return found._replace(value=np.minimum(np.rad2deg(found.value), MOST_PHASE))
 
 
-def delay_margins(loops: LoopGains, grid: GridGain) -> np.ndarray:
-    """Smallest common further delay that makes a stable loop unstable [samples], (n,)."""
+def delay_margins(loops: LoopGains, grid: GridGain) -> MarginPlace:
+    """Smallest common further delay that makes stable loops unstable [samples], (n,) each."""
     columns = _columns(grid.radius >= STRONG)
     omega = np.take_along_axis(grid.omega, columns, axis=1)
     gain = np.take_along_axis(grid.gain, columns[..., None, None], axis=1)
@@ -95,7 +95,8 @@ def delay_margins(loops: LoopGains, grid: GridGain) -> np.ndarray:
         part = loops.part(places.loop[rows])
         return np.linalg.eigvals(part.exact(omega[:, None], t[:, None])[:, 0])
 
-    return np.minimum(_smallest(places, delay, rate, eigenvalues, n), MOST_DELAY)
+    late = _smallest(places, delay, np.ones(len(delay)), rate, eigenvalues, n)
+    return late._replace(value=np.minimum(late.value, MOST_DELAY))
 
 
 def _delays(loops: LoopGains, places: _Places) -> tuple[np.ndarray, np.ndarray]:
@@ -202,16 +203,22 @@ def _at_levels(
 
 
 def _smallest(
-    places: _Places, t: np.ndarray, rate: np.ndarray, eigenvalues: Callable[..., np.ndarray], n: int
-) -> np.ndarray:
-    """Smallest t of each loop at which an eigenvalue is -1, infinite if there is none, (n,).
+    places: _Places,
+    t: np.ndarray,
+    sign: np.ndarray,
+    rate: np.ndarray,
+    eigenvalues: Callable[..., np.ndarray],
+    n: int,
+) -> MarginPlace:
+    """Smallest t of each loop at which an eigenvalue is -1, infinite if there is none, (n,) each.
 
     Newton's iteration for the logarithm of -eigenvalue by (omega, t), with slopes from the grid
-    that each step corrects (Broyden 1965). Where it does not converge, the place on the grid counts.
+    that each step corrects (Broyden 1965). The place on the grid counts where it fails.
 
     Args:
         places: on the grid, p of them.
         t: there, (p,).
+        sign: of the phase there, (p,).
         rate: of the logarithm by t, (p,).
         eigenvalues: of L with t, (p, m), of (rows, omega, t).
         n: number of loops.
@@ -238,9 +245,13 @@ def _smallest(
         slope = slope + now[:, None] * step / size[:, None]
         turned = now
     is_good = (np.abs(turned) < 1e-4) & (value > 0) & (np.abs(value - start) < 0.5)
-    best = np.full(n, np.inf)
-    np.minimum.at(best, places.loop[rows], np.where(is_good, value, start))
-    return best
+    value, w = np.where(is_good, value, start), np.where(is_good, w, places.omega[rows])
+    found = MarginPlace(np.full(n, np.inf), np.ones(n), np.ones(n))
+    last_first = np.argsort(-value)  # the smallest is written last
+    owner = places.loop[rows][last_first]
+    for array, each in zip(found, (value, w, sign[rows]), strict=True):
+        array[owner] = each[last_first]
+    return found
 
 
 def _nearest_log(eigenvalue: np.ndarray) -> np.ndarray:

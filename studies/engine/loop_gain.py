@@ -7,7 +7,7 @@ equal.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -46,7 +46,7 @@ class LoopGains(NamedTuple):
     """L(e^(j omega T)) = -K P of n loops at the m commands that act; NumPy."""
 
     plant: PlantResponse  # leaves (n, ...)
-    controller: Controller  # of a linear system, its feedback is a `ModalSystem` if it can be
+    controller: Any  # Controller; a linear system's feedback is a `ModalSystem` if it can be
     pairs: np.ndarray  # products of a mode's rows and columns, see `_modal_sums`, (n, 3, R, p)
     acting: np.ndarray  # numbers of the commands, (m,)
 
@@ -57,8 +57,8 @@ class LoopGains(NamedTuple):
 
     def part(self, rows: np.ndarray) -> LoopGains:
         """Some of the loops, also repeated."""
-        chosen: LoopGains = jax.tree.map(lambda x: x[rows], self._replace(acting=None))
-        return chosen._replace(acting=self.acting)
+        plant, controller, pairs = jax.tree.map(lambda x: x[rows], self[:3])
+        return LoopGains(plant, controller, pairs, self.acting)
 
     def searched(self, omega: np.ndarray) -> np.ndarray:
         """L to 1e-4, (n, F, m, m).
@@ -83,6 +83,8 @@ class LoopGains(NamedTuple):
         return self._gains(omega, delay, is_exact=False)
 
     def _gains(self, omega: np.ndarray, delay: np.ndarray, is_exact: bool) -> np.ndarray:
+        if not omega.size:
+            return np.zeros((*omega.shape, *[len(self.acting)] * 2), complex)
         order = _ALL if is_exact else _FEW
         step = max(1, AT_ONCE // (omega.shape[1] * len(order)))
         if step >= len(omega):
@@ -155,7 +157,7 @@ def loop_gains(response: SampledLoopResponse) -> LoopGains:
     probe = np.exp(1j * np.array([0.3, 3.0]))
     seen = _feedback(response.controller, np.broadcast_to(probe, (len(rows), 2)))
     acting = np.flatnonzero(np.any(seen != 0, axis=(0, 1, 3)))
-    controller = response.controller
+    controller: Any = response.controller
     if isinstance(controller.feedback, StateSpace):
         controller = controller._replace(feedback=_modal_form(controller.feedback))
     return LoopGains(plant, controller, pairs.reshape(*pairs.shape[:3], -1), acting)
@@ -195,7 +197,7 @@ def _electronics(plant: PlantResponse, omega: np.ndarray, w: np.ndarray) -> np.n
     return gain
 
 
-def _feedback(controller: Controller, z: np.ndarray) -> np.ndarray:
+def _feedback(controller: Any, z: np.ndarray) -> np.ndarray:
     """See `jaxmodel.frequency_response.controller_response`, (n, F, 3 K, 3 K)."""
     feedback, through, notch = controller.feedback, controller.feedthrough, controller.notch
     if isinstance(feedback, Channels):

@@ -22,7 +22,7 @@ from jaxmodel.laws.imsc import IMSC
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.return_difference import assembled_modes
-from jaxmodel.robustness import MARGINS, MOST_DELAY, MOST_PHASE, PEAKS, robustness_figures
+from jaxmodel.robustness import MARGINS, MOST_DELAY, MOST_PHASE, PEAKS, MarginPlace, norm_peaks
 from studies.engine.crossings import delay_margins, phase_margins
 from studies.engine.disk_margin import LARGEST, disk_margins
 from studies.engine.loop_gain import LoopGains, acting_commands, loop_gains
@@ -34,10 +34,11 @@ from studies.engine.stability import with_margin_modes
 #: Loops per call; each core takes one call after another.
 BATCH = 8
 #: How each margin is searched, and what it is where no command acts.
-SEARCHES: dict[str, tuple[Callable[[LoopGains, GridGain], np.ndarray], float]] = {
+SEARCHES: dict[str, tuple[Callable[[LoopGains, GridGain, bool], MarginPlace], float]] = {
     "disk_margin": (disk_margins, LARGEST),
-    "phase_margin": (phase_margins, MOST_PHASE),
-    "delay_margin": (delay_margins, MOST_DELAY),
+    # always as exact as derivatives need
+    "phase_margin": (lambda loops, grid, _: phase_margins(loops, grid), MOST_PHASE),
+    "delay_margin": (lambda loops, grid, _: delay_margins(loops, grid), MOST_DELAY),
 }
 
 
@@ -96,8 +97,9 @@ def _figures_of(
 
     def judge(part: np.ndarray) -> dict[str, np.ndarray]:
         response, modes = _responses(structure, jax.tree.map(lambda x: x[part], whole))
-        found = _peaks_of(response, tuple(x for x in names if x in PEAKS))
-        return found | _margins_of(response, modes, tuple(x for x in names if x in MARGINS))
+        places = find_margins(response, modes, tuple(x for x in names if x in MARGINS))
+        margins = {name: place.value for name, place in places.items()}
+        return margins | _peaks_of(response, tuple(x for x in names if x in PEAKS))
 
     with threadpool_limits(1, "blas"), ThreadPoolExecutor(len(jax.local_devices())) as pool:
         judged = list(pool.map(judge, parts))
@@ -108,27 +110,41 @@ def _peaks_of(response: SampledLoopResponse, names: tuple[str, ...]) -> dict[str
     return jax.tree.map(np.asarray, _figures(names, response)) if names else {}
 
 
-def _margins_of(
-    response: SampledLoopResponse, modes: tuple[Array, Array], names: tuple[str, ...]
-) -> dict[str, np.ndarray]:
-    """Margins of stable loops; NaN where a number is not finite."""
+def find_margins(
+    response: SampledLoopResponse,
+    modes: tuple[Array, Array],
+    names: tuple[str, ...],
+    is_fine: bool = False,
+) -> dict[str, MarginPlace]:
+    """Margins of stable loops and where they are, (n,) each; NaN where a number is not finite.
+
+    Args:
+        response: leaves (n, ...).
+        modes: frequencies [rad/s] and decay [1/s] of the machines' modes, (n, k) each.
+        names: of `MARGINS`.
+        is_fine: places as exact as derivatives need.
+    """
     # loops near the edge need more than single precision
     response, modes = jax.tree.map(lambda x: np.asarray(x, float), (response, modes))
     leaves = [x.reshape(len(x), -1) for x in jax.tree.leaves((response, modes))]
     is_finite = np.all([np.isfinite(x).all(axis=1) for x in leaves], axis=0)
-    acting = acting_commands(response.controller)
-    found = {name: np.full(len(is_finite), np.nan) for name in names}
+    acting, count = acting_commands(response.controller), len(is_finite)
+    found = {
+        name: MarginPlace(np.full(count, np.nan), np.ones(count), np.ones(count)) for name in names
+    }
     for pattern in np.unique(acting[is_finite], axis=0) if names else ():
         rows = np.flatnonzero(is_finite & np.all(acting == pattern, axis=1))
         if not pattern.any():
             for name in names:
-                found[name][rows] = SEARCHES[name][1]
+                found[name].value[rows] = SEARCHES[name][1]
             continue
         part, (omega, decay) = jax.tree.map(lambda x, rows=rows: x[rows], (response, modes))
         loops = loop_gains(part)
         grid = search_grid(loops, omega, decay)
         for name in names:
-            found[name][rows] = SEARCHES[name][0](loops, grid)
+            places = SEARCHES[name][0](loops, grid, is_fine)
+            for array, each in zip(found[name], places, strict=True):
+                array[rows] = each
     return found
 
 
@@ -137,17 +153,18 @@ def _margins_of(
 def _responses(
     structure: Structure, cases: Case
 ) -> tuple[SampledLoopResponse, tuple[Array, Array]]:
-    """Responses, and frequencies [rad/s] and decay [1/s] of the machines' modes."""
+    return jax.vmap(lambda case: response_and_modes(structure, case, case.path.waypoints[0]))(cases)
 
-    def one(case: Case) -> tuple[SampledLoopResponse, tuple[Array, Array]]:
-        loop = prepare(structure, case).loop
-        response = response_of_loop(structure, case, loop, case.path.waypoints[0])
-        modes = assembled_modes(response.plant)
-        return response, (modes.omega, modes.decay)
 
-    return jax.vmap(one)(cases)
+def response_and_modes(
+    structure: Structure, case: Case, pose: Array
+) -> tuple[SampledLoopResponse, tuple[Array, Array]]:
+    """What `find_margins` reads of a loop about rest at a pose."""
+    response = response_of_loop(structure, case, prepare(structure, case).loop, pose)
+    modes = assembled_modes(response.plant)
+    return response, (modes.omega, modes.decay)
 
 
 @kept_jit(static_argnums=0)
 def _figures(names: tuple[str, ...], responses: SampledLoopResponse) -> dict[str, Any]:
-    return jax.lax.map(lambda response: robustness_figures(response, names), responses)
+    return jax.lax.map(lambda response: norm_peaks(response, names), responses)
