@@ -14,6 +14,8 @@ from studies.engine.loop_gain import LoopGains, ModalSystem
 
 #: Frequencies evenly on a logarithmic axis, and beside each mode that matters, in half-widths.
 BACKGROUND, BESIDE = 40, np.tan(np.array([-1.35, -0.75, 0.75, 1.35]))
+#: Shifts of the points at modes that coincide, at most six, in half-widths.
+APART = np.array([0.0, 0.1, -0.1, 0.2, -0.2, 0.3])
 #: A frequency matters if its L could move a singular value by this share of the largest move seen
 #: at the strongest ones, which are this many.
 MATTERS = 0.5
@@ -52,6 +54,11 @@ def search_grid(loops: LoopGains, omega: np.ndarray, decay: np.ndarray) -> GridG
         rate = np.log(np.maximum(np.abs(pole), 1e-9)) * top / np.pi
         omega = np.concatenate([omega, np.abs(np.angle(pole)) * top / np.pi], axis=1)
         decay = np.concatenate([decay, np.abs(rate)], axis=1)
+    order = np.argsort(omega, axis=1)
+    omega, decay = (np.take_along_axis(x, order, axis=1) for x in (omega, decay))
+    width = np.maximum(decay, NARROWEST * omega)
+    # modes of equal links coincide: frequencies apart tell which way a singular value rises
+    omega = omega + np.resize(APART, omega.shape[1]) * width
     background = lowest * (top / lowest) ** np.linspace(0, 1, BACKGROUND)
     first = np.concatenate([folded(omega), folded(background)], axis=1)
     gain = loops.searched(first)
@@ -63,8 +70,8 @@ def search_grid(loops: LoopGains, omega: np.ndarray, decay: np.ndarray) -> GridG
     size = radius[:, : omega.shape[1]]
     count = int(np.max(np.sum(could_exceed(size, move[:, None]), axis=1)))
     chosen = np.argsort(-size, axis=1)[:, :count]
-    omega, decay = (np.take_along_axis(x, chosen, axis=1) for x in (omega, decay))
-    beside = omega[..., None] + BESIDE * np.maximum(decay, NARROWEST * omega)[..., None]
+    omega, width = (np.take_along_axis(x, chosen, axis=1) for x in (omega, width))
+    beside = omega[..., None] + BESIDE * width[..., None]
     more = folded(beside.reshape(len(omega), -1))
     other = loops.searched(more)
     omega = np.concatenate([first, more], axis=1)
