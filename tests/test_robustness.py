@@ -182,17 +182,18 @@ def delayed(loop: Loop, delay: float) -> float:
 
 
 def analogue_of(loop: Loop) -> Any:
-    smooth = loop.structure._replace(is_smooth=True, feedback="sampled")
-
-    def matrices(case):
-        plant = linearise(smooth, prepare(smooth, case).loop, POSE, resting(smooth, case))
-        found = analogue_plant(smooth, plant, case)
-        return found.state, found.enters
-
     if id(loop.matrices) not in _ANALOGUES:
-        state, enters = map(np.asarray, jax.jit(matrices)(loop.case))
+        state, enters = map(np.asarray, _analogue(loop.structure, loop.case))
         _ANALOGUES[id(loop.matrices)] = AnaloguePlant(state, enters)
     return _ANALOGUES[id(loop.matrices)]
+
+
+@partial(jax.jit, static_argnums=0)
+def _analogue(structure, case):
+    smooth = structure._replace(is_smooth=True, feedback="sampled")
+    plant = linearise(smooth, prepare(smooth, case).loop, POSE, resting(smooth, case))
+    found = analogue_plant(smooth, plant, case)
+    return found.state, found.enters
 
 
 class AnaloguePlant(NamedTuple):
@@ -379,7 +380,7 @@ def test_gradients_are_those_of_differences():
         ("srf", 5, (True, True, False)),
         pytest.param("modified_imsc", 3, (True, True, True)),
         pytest.param("lqg", 5, (False, True, True)),
-        pytest.param("observer", 2, (True, True, True)),
+        pytest.param("observer", 3, (True, True, True)),
     ],
 )
 def test_every_law_is_judged(law, patches, links):
@@ -400,10 +401,53 @@ def test_every_law_is_judged(law, patches, links):
     cases = build_cases(study, {"control.gain_factor": factors}, structure)
     margin = judge_loops(structure, cases).gain_margin
     found = judge_robustness(structure, cases, MARGINS, margin)
+    is_stable = margin >= 1
+    assert is_stable[0]
     for name, most in zip(MARGINS, (2.0, 180.0, MOST_DELAY), strict=True):
         assert found[name][0] == pytest.approx(most, rel=1e-6)
-        assert 0 < found[name][1] <= most * (1 + 1e-6)
-        assert found[name][2] == 0
+        assert (found[name][is_stable] > 0).all()
+        assert (found[name] <= most * (1 + 1e-6)).all()
+        assert (found[name][~is_stable] == 0).all()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("law", ["imsc", "lqr"])
+def test_no_margin_of_random_loops_is_too_large(law):
+    """50 loops of each law: stable up to 0.99 of a margin, unstable a little beyond it."""
+    count, rng = 50, np.random.default_rng(4)
+    study = STUDY.change(control__law=law)
+    columns = {
+        "control.gain_factor": np.exp(rng.uniform(np.log(0.05), np.log(0.8), count)),
+        "machine.platform_mass": rng.uniform(0.1, 0.4, count),
+        "electronics.antialias_hz": rng.uniform(1500.0, 4500.0, count),
+    }
+    structure = build_structure(study)
+    cases = build_cases(study, columns, structure)
+    structure, cases = with_margin_modes(structure, as_arrays(cases))
+    cases = jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x)[1:])), cases)
+    both = jax.jit(jax.vmap(lambda case: (*_both(structure, case), _analogue(structure, case))))
+    response, modes, matrices, analogue = jax.tree.map(np.asarray, both(cases))
+    places = find_margins(response, modes, MARGINS)
+    edges = 0
+    for k in range(count):
+        part = jax.tree.map(lambda x, k=k: x[k], (response, modes, matrices))
+        loop = Loop(structure, None, *part, float(cases.electronics.period[k]))
+        _ANALOGUES[id(loop.matrices)] = AnaloguePlant(*(x[k] for x in analogue))
+        if turned(loop, 1.0) >= 1:
+            continue
+        phase = np.deg2rad(places["phase_margin"].value[k])
+        late = places["delay_margin"].value[k]
+        for share in (0.5, 0.8, 0.9, 0.95, 0.99):
+            assert turned(loop, np.exp(1j * share * phase)) < 1
+            assert turned(loop, np.exp(-1j * share * phase)) < 1
+            assert delayed(loop, share * late) < 1
+        if phase < np.pi:
+            edges += 1
+            assert max(turned(loop, np.exp(1j * x * phase)) for x in (1.001, -1.001)) > 1
+        if late < MOST_DELAY:
+            assert delayed(loop, 1.001 * late) > 1
+        del _ANALOGUES[id(loop.matrices)]
+    assert edges > count // 2
 
 
 def test_what_a_disk_margin_guarantees():
@@ -427,7 +471,7 @@ def test_limits_of_tunings_have_the_gradients_of_differences(monkeypatch):
     spec = tuning({**GAIN, "drive.kp": EVERY_KIND["drive.kp"]}, limits=limits)
     linear = LinearFidelity(spec, [spec.families[0]] * 4)
     steps = np.array([[0.0, 0.0], [1e-5, 0.0], [-1e-5, 0.0]])
-    designs = np.concatenate([[0.4, 2e4] * (1 + steps), [[2.0, 2e4]]])
+    designs = np.concatenate([[0.4, 2e4] * (1 + steps), [[200.0, 2e4]]])
     excess, slopes = linear.limits(designs)
     wanted = (excess[1] - excess[2]) / (designs[1, 0] - designs[2, 0])
     np.testing.assert_allclose(slopes[0, :, 0], wanted, rtol=1e-4, atol=1e-6)
