@@ -166,8 +166,18 @@ def _crossings(
         angle = np.angle(-a) + share * ratio.imag
         log = 1j * ((angle + np.pi) % (2 * np.pi) - np.pi)
         slope = ratio / np.where(end > begin, end - begin, 1.0)
-        where = begin + share * (end - begin)
-        parts.append(_Places(loop[row], level[row], where, log, slope, begin, end, column))
+        parts.append(
+            _Places(
+                loop=loop[row],
+                level=level[row],
+                omega=begin + share * (end - begin),
+                log=log,
+                slope=slope,
+                left=begin,
+                right=end,
+                column=column,
+            )
+        )
     return _joined(parts)
 
 
