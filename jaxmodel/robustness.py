@@ -20,7 +20,7 @@ from jaxmodel.frequency_response import (
     command_gain,
 )
 from jaxmodel.lazy import jax, jnp
-from jaxmodel.loop_figures import MARGINS, MOST_DELAY, PEAKS
+from jaxmodel.loop_figures import MOST_DELAY, MOST_PHASE, PEAKS
 from jaxmodel.parameters import Array
 from jaxmodel.return_difference import NARROWEST, assembled_modes
 from jaxmodel.scaling import best_scaling

@@ -15,16 +15,9 @@ from scipy.optimize import brentq, minimize, minimize_scalar
 
 from jaxmodel.frequency_response import close_loop, command_gain
 from jaxmodel.linear import linearise, resting
+from jaxmodel.loop_figures import MARGINS, MOST_DELAY, PEAKS, guaranteed_range
 from jaxmodel.prepare import prepare
-from jaxmodel.robustness import (
-    MARGINS,
-    MOST_DELAY,
-    PEAKS,
-    guaranteed_range,
-    margin_at,
-    norm_peaks,
-    search_frequencies,
-)
+from jaxmodel.robustness import margin_at, norm_peaks, search_frequencies
 from jaxmodel.sampled_loop import analogue_plant, closed_loop
 from jaxmodel.scaling import best_scaling
 from studies.engine import diagonal_scaling

@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxmodel.robustness import MOST_DELAY, MOST_PHASE, MarginPlace
+from jaxmodel.loop_figures import MOST_DELAY, MOST_PHASE
+from jaxmodel.robustness import MarginPlace
 from studies.engine.loop_gain import LoopGains
 from studies.engine.margin_grid import GridGain
 

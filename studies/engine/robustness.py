@@ -19,10 +19,11 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.frequency_response import SampledLoopResponse, response_of_loop
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.imsc import IMSC
+from jaxmodel.loop_figures import MARGINS, MOST_DELAY, MOST_PHASE, PEAKS
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.return_difference import assembled_modes
-from jaxmodel.robustness import MARGINS, MOST_DELAY, MOST_PHASE, PEAKS, MarginPlace, norm_peaks
+from jaxmodel.robustness import MarginPlace, norm_peaks
 from studies.engine.crossings import delay_margins, phase_margins
 from studies.engine.disk_margin import LARGEST, disk_margins
 from studies.engine.loop_gain import LoopGains, acting_commands, loop_gains

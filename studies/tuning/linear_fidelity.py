@@ -22,7 +22,7 @@ from jaxmodel.linear_residual import linear_residual
 from jaxmodel.loop_figures import MARGINS, PEAKS
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
-from jaxmodel.robustness import MARGINS, PEAKS, MarginPlace, margin_at, norm_peaks
+from jaxmodel.robustness import MarginPlace, margin_at, norm_peaks
 from jaxmodel.sampled_loop import LoopMatrices, closed_loop, slowest_decay, spillover
 from studies.engine.plan import padded_rows
 from studies.engine.programs import kept_jit
