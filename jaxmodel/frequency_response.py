@@ -204,34 +204,41 @@ def _normal_modes(plant: Plant, inertia: Array | None, springs: Array | None) ->
 
 
 @cache
-def _extrapolation() -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients of n^-4, n^-6, n^-8 and of n^-3, n^-5, n^-7 from values at `ANCHORS`."""
+def tail_weights() -> tuple[np.ndarray, np.ndarray]:
+    """What the images beyond `IMAGES` add to the weights of those at `ANCHORS`.
+
+    They are sums of powers of 1/n: pairs f(n) + f(-n) of even ones from n^-4, pairs f(n) - f(-n) of
+    odd ones from n^-3, since hold and anti-alias filter fall as n^-3 or faster.
+
+    Returns:
+        Factors of cos(2 pi n tau) and of -j sin(2 pi n tau), n = `IMAGES` + 1.., (.., I) each.
+    """
     anchors = np.array(ANCHORS, float)[:, None]
-    even, odd = anchors ** -np.array([4.0, 6.0, 8.0]), anchors ** -np.array([3.0, 5.0, 7.0])
-    return np.linalg.inv(even), np.linalg.inv(odd)
+    beyond = np.arange(IMAGES + 1, IMAGES + 1 + _SUMMED)[:, None]
+    even, odd = (
+        beyond**-powers @ np.linalg.inv(anchors**-powers)
+        for powers in (np.array([4.0, 6.0, 8.0]), np.array([3.0, 5.0, 7.0]))
+    )
+    places = np.array(ANCHORS)
+    whole = np.zeros((2, _SUMMED, 2 * IMAGES + 1))
+    whole[:, :, IMAGES + places] = even, odd
+    whole[:, :, IMAGES - places] = even, -odd
+    return whole[0], whole[1]
 
 
 def image_weights(delay: Array) -> Array:
     """Weights of the responses at s_n, n = -`IMAGES`.. `IMAGES`, whose sum a sampler sees, (I,).
 
-    A delay of tau samples turns image n by -2 pi n tau, beside the -omega T tau of all. The images
-    beyond are sums of powers of 1/n: pairs f(n) + f(-n) of even ones from n^-4, pairs f(n) - f(-n)
-    of odd ones from n^-3, since hold and anti-alias filter fall as n^-3 or faster.
+    A delay of tau samples turns image n by -2 pi n tau, beside the -omega T tau of all.
 
     Args:
         delay: tau [samples], ().
     """
-    even, odd = _extrapolation()
-    n = np.arange(-IMAGES, IMAGES + 1)
-    beyond = np.arange(IMAGES + 1, IMAGES + 1 + _SUMMED)[:, None]
+    even, odd = tail_weights()
+    beyond = np.arange(IMAGES + 1, IMAGES + 1 + _SUMMED)
     turn = 2 * np.pi * jnp.asarray(delay)
-    cosine, sine = jnp.cos(turn * beyond[:, 0]), jnp.sin(turn * beyond[:, 0])
-    powers = beyond ** -np.array([4.0, 6.0, 8.0]), beyond ** -np.array([3.0, 5.0, 7.0])
-    pairs = cosine @ powers[0] @ even, sine @ powers[1] @ odd
-    anchors = np.array(ANCHORS)
-    weights = jnp.exp(-1j * turn * n)
-    weights = weights.at[IMAGES + anchors].add(pairs[0] - 1j * pairs[1])
-    return weights.at[IMAGES - anchors].add(pairs[0] + 1j * pairs[1])
+    weights = jnp.exp(-1j * turn * np.arange(-IMAGES, IMAGES + 1))
+    return weights + jnp.cos(turn * beyond) @ even - 1j * (jnp.sin(turn * beyond) @ odd)
 
 
 class Images(NamedTuple):
@@ -379,15 +386,6 @@ def command_gain(response: SampledLoopResponse, omega: Array, delay: Array | Non
     turned = image_weights(late) * jnp.exp(-1j * omega * plant.period * late)
     sensed = jnp.einsum("n,nab->ab", turned, plant_images(plant, omega, order).sensed)
     return -controller_response(response.controller, jnp.exp(1j * omega * plant.period)) @ sensed
-
-
-def command_gain_images(response: SampledLoopResponse, omega: Array) -> Array:
-    """Parts of L by the first images, -`FEW`.. `FEW`; their sum lacks 1e-4, (I, 3 K, 3 K)."""
-    plant, order = response.plant, np.arange(-FEW, FEW + 1)
-    sensed = plant_images(plant, omega, order).sensed
-    turned = jnp.exp(-1j * (omega * plant.period + 2 * np.pi * order) * plant.late)
-    gain = controller_response(response.controller, jnp.exp(1j * omega * plant.period))
-    return -gain @ sensed * turned[:, None, None]
 
 
 class ClosedLoop(NamedTuple):

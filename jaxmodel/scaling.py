@@ -31,11 +31,6 @@ class BestScaling(NamedTuple):
     slope: Array  # G: the bound changes by Re sum(conj(G) dM), complex, (n, n)
 
 
-def scaled(matrix: Array, sweeps: int = SWEEPS) -> Array:
-    """D M D^-1 with rows and columns of equal length, which is near the best one, (n, n)."""
-    return _apply(matrix, _balance(matrix, sweeps))
-
-
 def _balance(matrix: Array, sweeps: int = SWEEPS) -> Array:
     """ln of the diagonal of D that minimises the sum of squares (Osborne 1960), (n,)."""
     n = matrix.shape[0]

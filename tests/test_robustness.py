@@ -13,22 +13,18 @@ import pytest
 from scipy.linalg import expm
 from scipy.optimize import brentq, minimize, minimize_scalar
 
-from jaxmodel.frequency_response import close_loop, command_gain, response_of_loop
+from jaxmodel.frequency_response import close_loop, command_gain
 from jaxmodel.linear import linearise, resting
+from jaxmodel.loop_figures import MARGINS, MOST_DELAY, PEAKS, guaranteed_range
 from jaxmodel.prepare import prepare
-from jaxmodel.robustness import (
-    MARGINS,
-    MOST_DELAY,
-    PEAKS,
-    guaranteed_range,
-    robustness_figures,
-    search_frequencies,
-)
+from jaxmodel.robustness import margin_at, norm_peaks, search_frequencies
 from jaxmodel.sampled_loop import analogue_plant, closed_loop
-from jaxmodel.scaling import best_scaling, scaled
+from jaxmodel.scaling import best_scaling
+from studies.engine import diagonal_scaling
+from studies.engine.loop_gain import loop_gains
 from studies.engine.margins import judge_loops
 from studies.engine.results import read_sweep
-from studies.engine.robustness import judge_robustness
+from studies.engine.robustness import find_margins, judge_robustness, response_and_modes
 from studies.engine.stability import with_margin_modes
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
@@ -60,7 +56,8 @@ class Loop(NamedTuple):
 
     structure: Any
     case: Any
-    response: Any
+    response: Any  # NumPy
+    modes: Any
     matrices: Any  # NumPy
     period: float
 
@@ -72,20 +69,24 @@ class Loop(NamedTuple):
 
 @partial(jax.jit, static_argnums=0)
 def _both(structure, case):
-    loop = prepare(structure, case).loop
-    return response_of_loop(structure, case, loop, POSE), closed_loop(structure, case, POSE)
+    return *response_and_modes(structure, case, POSE), closed_loop(structure, case, POSE)
 
 
 @cache
 def loop_of(name: str, law: str = "imsc", factor: float = 0.5) -> Loop:
     study = STUDY.change(**PLANTS[name], control__law=law, control__gain_factor=factor)
     structure, case = with_margin_modes(build_structure(study), as_arrays(build_case(study)))
-    response, matrices = _both(structure, case)
-    period = float(case.electronics.period)
-    return Loop(structure, case, response, jax.tree.map(np.asarray, matrices), period)
+    response, modes, matrices = jax.tree.map(np.asarray, _both(structure, case))
+    return Loop(structure, case, response, modes, matrices, float(case.electronics.period))
 
 
-_figures = jax.jit(robustness_figures, static_argnums=1)
+def margins_of(loop: Loop, is_fine: bool = False) -> dict[str, float]:
+    one = jax.tree.map(lambda x: x[None], (loop.response, loop.modes))
+    places = find_margins(*one, MARGINS, is_fine)
+    return {name: float(place.value[0]) for name, place in places.items()}
+
+
+_peaks = jax.jit(norm_peaks, static_argnums=1)
 
 
 def exact_gain(loop: Loop, omega: float) -> np.ndarray:
@@ -103,6 +104,25 @@ def test_the_response_is_that_of_the_matrices(name):
         omega = 2 * np.pi * hertz
         found, wanted = command_gain(loop.response, omega), exact_gain(loop, omega)
         np.testing.assert_allclose(found, wanted, atol=1e-6 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize(
+    ("name", "law"), [*((name, "imsc") for name in PLANTS), ("plain", "lqr"), ("plain", "lqg")]
+)
+def test_the_search_uses_the_same_response(name, law):
+    """In NumPy, also with a further delay; 1e-4 with few images of the spectrum."""
+    loop = loop_of(name, law)
+    gains = loop_gains(jax.tree.map(lambda x: x[None], loop.response))
+    omega = 2 * np.pi * np.array([3.0, 114.4, 457.0, 2000.0, 4400.0])
+    gain = jax.jit(lambda w, delay: command_gain(loop.response, w, delay))
+    acting = np.ix_(gains.acting, gains.acting)
+    for delay in (0.0, 0.3):
+        wanted = np.stack([np.asarray(gain(w, delay))[acting] for w in omega])
+        scale = np.abs(wanted).max()
+        late = np.full((1, len(omega)), delay)
+        np.testing.assert_allclose(gains.exact(omega[None], late)[0], wanted, atol=1e-12 * scale)
+        found = gains.at_delay(omega[None], late)[0]
+        np.testing.assert_allclose(found, wanted, atol=3e-4 * scale)
 
 
 def test_the_closed_loop_is_that_of_the_matrices():
@@ -155,17 +175,18 @@ def delayed(loop: Loop, delay: float) -> float:
 
 
 def analogue_of(loop: Loop) -> Any:
-    smooth = loop.structure._replace(is_smooth=True, feedback="sampled")
-
-    def matrices(case):
-        plant = linearise(smooth, prepare(smooth, case).loop, POSE, resting(smooth, case))
-        found = analogue_plant(smooth, plant, case)
-        return found.state, found.enters
-
     if id(loop.matrices) not in _ANALOGUES:
-        state, enters = map(np.asarray, jax.jit(matrices)(loop.case))
+        state, enters = map(np.asarray, _analogue(loop.structure, loop.case))
         _ANALOGUES[id(loop.matrices)] = AnaloguePlant(state, enters)
     return _ANALOGUES[id(loop.matrices)]
+
+
+@partial(jax.jit, static_argnums=0)
+def _analogue(structure, case):
+    smooth = structure._replace(is_smooth=True, feedback="sampled")
+    plant = linearise(smooth, prepare(smooth, case).loop, POSE, resting(smooth, case))
+    found = analogue_plant(smooth, plant, case)
+    return found.state, found.enters
 
 
 class AnaloguePlant(NamedTuple):
@@ -189,7 +210,7 @@ QUICK = ("imsc", "lqr")
 def test_margins_are_where_a_pole_reaches_the_circle(law):
     """Commands turned, or late by exact discretisation: stable before, at the edge there."""
     loop = loop_of("plain", law, LOOPS[law])
-    found = {name: float(x) for name, x in _figures(loop.response, MARGINS).items()}
+    found = margins_of(loop)
     assert turned(loop, 1.0) < 1
     edge = np.deg2rad(found["phase_margin"])
     assert all(turned(loop, np.exp(1j * x)) < 1 for x in np.linspace(-0.9999, 0.9999, 12) * edge)
@@ -235,19 +256,23 @@ def test_the_scaling_is_the_best_one():
         ends = [float(best_scaling(matrix + h * change).bound) for h in (1e-5, -1e-5)]
         slope = np.real(np.sum(np.conj(found.slope) * change))
         assert slope == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-4)
+        searched, log = diagonal_scaling.best_scaling(matrix[None])
+        assert found.bound * (1 - 1e-9) <= searched[0] <= found.bound * (1 + 1e-4)
+        norm = np.linalg.norm(matrix * np.exp(log[0][:, None] - log[0]), 2)
+        assert norm == pytest.approx(searched[0], rel=1e-9)
 
 
 @pytest.mark.parametrize("law", ["imsc", "lqr"])
 def test_the_disk_margin_is_the_smallest_over_all_frequencies(law):
     loop = loop_of("plain", law, LOOPS[law])
-    found = float(_figures(loop.response, MARGINS)["disk_margin"])
+    found = margins_of(loop, is_fine=True)["disk_margin"]
 
     def excess(omega: float) -> np.ndarray:
         gain = exact_gain(loop, omega)
         return np.linalg.inv(np.eye(len(gain)) + gain) - np.eye(len(gain)) / 2
 
     def balanced(omega: float) -> float:
-        return float(np.linalg.norm(np.asarray(_scaled(excess(omega))), 2))
+        return float(np.linalg.norm(diagonal_scaling.balanced(excess(omega)[None])[0], 2))
 
     omega = np.asarray(search_frequencies(loop.response))
     rough = np.array([balanced(x) for x in omega])
@@ -265,13 +290,13 @@ def test_the_disk_margin_is_the_smallest_over_all_frequencies(law):
     assert smallest_norm(excess(at.x)) == pytest.approx(1 / found, rel=1e-6)
 
 
-_scaled, _best = jax.jit(scaled), jax.jit(best_scaling)
+_best = jax.jit(best_scaling)
 
 
 def test_no_perturbation_inside_the_disk_breaks_the_loop():
     """By the eigenvalues of the matrices with random errors of the actuators as large as it."""
     loop, rng = loop_of("plain"), np.random.default_rng(2)
-    alpha = float(_figures(loop.response, MARGINS)["disk_margin"])
+    alpha = margins_of(loop, is_fine=True)["disk_margin"]
     m, at = loop.matrices, loop.commands
     count = 3 * loop.structure.n_patches
 
@@ -285,7 +310,7 @@ def test_no_perturbation_inside_the_disk_breaks_the_loop():
 @pytest.mark.parametrize("name", PEAKS)
 def test_peaks_are_those_of_singular_values(name):
     loop = loop_of("plain")
-    found = float(_figures(loop.response, PEAKS)[name])
+    found = float(_peaks(loop.response, PEAKS)[name])
     field = name.removesuffix("_peak")
 
     @jax.jit
@@ -307,29 +332,37 @@ def test_peaks_are_those_of_singular_values(name):
 
 @pytest.mark.long
 def test_gradients_are_those_of_differences():
-    """By gains, drive, placement and delay of all figures."""
+    """By gains, drive and placement of all figures."""
     loop = loop_of("plain", "lqr", LOOPS["lqr"])
     structure, case = loop.structure, jax.tree.map(jnp.asarray, loop.case)
 
-    def figures(x):
+    @jax.jit
+    def response(x):
         control = case.control._replace(gain_factor=case.control.gain_factor * x[0])
         drive = case.drive._replace(kp=case.drive.kp * x[1])
         patches = case.machine.patches
         patches = patches._replace(center=patches.center * x[2])
-        changed = case._replace(
-            control=control, drive=drive, machine=case.machine._replace(patches=patches)
-        )
-        response = response_of_loop(structure, changed, prepare(structure, changed).loop, POSE)
-        found = robustness_figures(response, (*MARGINS, *PEAKS))
+        machine = case.machine._replace(patches=patches)
+        changed = case._replace(control=control, drive=drive, machine=machine)
+        return response_and_modes(structure, changed, POSE)
+
+    def places(x):
+        one = jax.tree.map(lambda x: np.asarray(x)[None], response(x))
+        found = find_margins(*one, MARGINS, is_fine=True)
+        return jax.tree.map(lambda x: x[0], found)
+
+    @jax.jit
+    def figures(x, places):
+        found = norm_peaks(response(x)[0], PEAKS)
+        found |= {name: margin_at(response(x)[0], name, places[name]) for name in MARGINS}
         return jnp.log(jnp.stack([found[name] for name in (*MARGINS, *PEAKS)]))
 
-    both = jax.jit(lambda x: (figures(x), jax.jacrev(figures)(x)))
-    _, slope = both(jnp.ones(3))
+    slope = jax.jit(jax.jacrev(figures))(jnp.ones(3), places(jnp.ones(3)))
     step = 1e-5
     for k, unit in enumerate(np.eye(3)):
-        high, low = (np.asarray(both(1 + sign * step * unit)[0]) for sign in (1, -1))
-        wanted = (high - low) / (2 * step)
-        np.testing.assert_allclose(slope[:, k], wanted, rtol=1e-4, atol=1e-5)
+        ends = [1 + sign * step * unit for sign in (1, -1)]
+        high, low = (np.asarray(figures(x, places(x))) for x in ends)
+        np.testing.assert_allclose(slope[:, k], (high - low) / (2 * step), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.long
@@ -340,7 +373,7 @@ def test_gradients_are_those_of_differences():
         ("srf", 5, (True, True, False)),
         pytest.param("modified_imsc", 3, (True, True, True)),
         pytest.param("lqg", 5, (False, True, True)),
-        pytest.param("observer", 2, (True, True, True)),
+        pytest.param("observer", 3, (True, True, True)),
     ],
 )
 def test_every_law_is_judged(law, patches, links):
@@ -361,10 +394,54 @@ def test_every_law_is_judged(law, patches, links):
     cases = build_cases(study, {"control.gain_factor": factors}, structure)
     margin = judge_loops(structure, cases).gain_margin
     found = judge_robustness(structure, cases, MARGINS, margin)
+    is_stable = margin >= 1
+    assert is_stable[0]
     for name, most in zip(MARGINS, (2.0, 180.0, MOST_DELAY), strict=True):
         assert found[name][0] == pytest.approx(most, rel=1e-6)
-        assert 0 < found[name][1] <= most * (1 + 1e-6)
-        assert found[name][2] == 0
+        assert (found[name][is_stable] > 0).all()
+        assert (found[name] <= most * (1 + 1e-6)).all()
+        assert (found[name][~is_stable] == 0).all()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("law", ["imsc", "lqr"])
+def test_no_margin_of_random_loops_is_too_large(law):
+    """50 loops of each law: stable up to 0.99 of a margin, mostly unstable beyond it."""
+    count, rng = 50, np.random.default_rng(4)
+    study = STUDY.change(control__law=law)
+    columns = {
+        "control.gain_factor": np.exp(rng.uniform(np.log(0.05), np.log(0.8), count)),
+        "machine.platform_mass": rng.uniform(0.1, 0.4, count),
+        "electronics.antialias_hz": rng.uniform(1500.0, 4500.0, count),
+    }
+    structure = build_structure(study)
+    cases = build_cases(study, columns, structure)
+    structure, cases = with_margin_modes(structure, as_arrays(cases))
+    cases = jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x)[1:])), cases)
+    both = jax.jit(jax.vmap(lambda case: (*_both(structure, case), _analogue(structure, case))))
+    response, modes, matrices, analogue = jax.tree.map(np.asarray, both(cases))
+    places = find_margins(response, modes, MARGINS)
+    edges = is_early = 0
+    for k in range(count):
+        part = jax.tree.map(lambda x, k=k: x[k], (response, modes, matrices))
+        loop = Loop(structure, None, *part, float(cases.electronics.period[k]))
+        _ANALOGUES[id(loop.matrices)] = AnaloguePlant(*(x[k] for x in analogue))
+        if turned(loop, 1.0) >= 1:
+            continue
+        phase = np.deg2rad(places["phase_margin"].value[k])
+        late = places["delay_margin"].value[k]
+        for share in (0.5, 0.8, 0.9, 0.95, 0.99):
+            assert turned(loop, np.exp(1j * share * phase)) < 1
+            assert turned(loop, np.exp(-1j * share * phase)) < 1
+            assert delayed(loop, share * late) < 1
+        if phase < np.pi:
+            edges += 1
+            assert max(turned(loop, np.exp(1j * x * phase)) for x in (1.001, -1.001)) > 1
+        is_early += bool(late < MOST_DELAY and delayed(loop, 1.001 * late) < 1)
+        del _ANALOGUES[id(loop.matrices)]
+    assert edges > count // 2
+    # where the solution of a place on the grid fails, the place counts, some percent too early
+    assert is_early <= count // 10
 
 
 def test_what_a_disk_margin_guarantees():
@@ -388,7 +465,7 @@ def test_limits_of_tunings_have_the_gradients_of_differences(monkeypatch):
     spec = tuning({**GAIN, "drive.kp": EVERY_KIND["drive.kp"]}, limits=limits)
     linear = LinearFidelity(spec, [spec.families[0]] * 4)
     steps = np.array([[0.0, 0.0], [1e-5, 0.0], [-1e-5, 0.0]])
-    designs = np.concatenate([[0.4, 2e4] * (1 + steps), [[2.0, 2e4]]])
+    designs = np.concatenate([[0.4, 2e4] * (1 + steps), [[200.0, 2e4]]])
     excess, slopes = linear.limits(designs)
     wanted = (excess[1] - excess[2]) / (designs[1, 0] - designs[2, 0])
     np.testing.assert_allclose(slopes[0, :, 0], wanted, rtol=1e-4, atol=1e-6)

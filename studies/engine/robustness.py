@@ -1,30 +1,46 @@
-"""Disk, phase and delay margins and H-infinity norms of every loop of a chunk, on demand.
+"""Disk, phase and delay margins and H-infinity norms of every loop of a chunk.
 
 See `jaxmodel.robustness`. Loops have `MARGIN_MODES` plant modes or more, at rest at the first
-way-point, like those of the gain margin, which tells the unstable ones.
+way-point, like those of the gain margin, which tells the unstable ones. Margins are searched in
+NumPy, several loops at once; norms by a compiled program.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.frequency_response import SampledLoopResponse, response_of_loop
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.imsc import IMSC
-from jaxmodel.loop_figures import MARGINS
+from jaxmodel.loop_figures import MARGINS, MOST_DELAY, MOST_PHASE, PEAKS
+from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
-from jaxmodel.robustness import robustness_figures
+from jaxmodel.return_difference import assembled_modes
+from jaxmodel.robustness import MarginPlace, norm_peaks
+from studies.engine.crossings import delay_margins, phase_margins
+from studies.engine.disk_margin import LARGEST, disk_margins
+from studies.engine.loop_gain import LoopGains, acting_commands, loop_gains
+from studies.engine.margin_grid import GridGain, search_grid
 from studies.engine.plan import padded_rows
 from studies.engine.programs import kept_jit
 from studies.engine.stability import with_margin_modes
 
 #: Loops per call; each core takes one call after another.
 BATCH = 8
+#: How each margin is searched, and what it is where no command acts.
+SEARCHES: dict[str, tuple[Callable[[LoopGains, GridGain, bool], MarginPlace], float]] = {
+    "disk_margin": (disk_margins, LARGEST),
+    # always as exact as derivatives need
+    "phase_margin": (lambda loops, grid, _: phase_margins(loops, grid), MOST_PHASE),
+    "delay_margin": (lambda loops, grid, _: delay_margins(loops, grid), MOST_DELAY),
+}
 
 
 def judge_robustness(
@@ -44,14 +60,17 @@ def judge_robustness(
         Each figure, (n,): of an unstable loop 0 for margins and infinite for peaks; NaN where the
         gain margin is.
     """
-    if not names:
-        return {}
-    if structure.feedback != "sampled":
-        return {name: np.full(len(gain_margin), np.nan) for name in names}
-    found = _of_parts(structure, cases, names, len(gain_margin))
+    count = len(gain_margin)
+    found = {name: np.full(count, np.nan) for name in names}
+    if not names or structure.feedback != "sampled":
+        return found
     for name, value in found.items():
         value[gain_margin < 1] = 0.0 if name in MARGINS else np.inf
-        value[np.isnan(gain_margin)] = np.nan
+    rows = np.flatnonzero(gain_margin >= 1)
+    if len(rows):
+        stable = jax.tree.map(lambda x: x if len(x) == 1 else x[rows], cases)
+        for name, value in _of_parts(structure, stable, names, len(rows)).items():
+            found[name][rows] = value
     return found
 
 
@@ -78,24 +97,75 @@ def _figures_of(
     parts = np.split(rows, len(rows) // BATCH)
 
     def judge(part: np.ndarray) -> dict[str, np.ndarray]:
-        response = _responses(structure, jax.tree.map(lambda x: x[part], whole))
-        return jax.tree.map(np.asarray, _figures(names, response))
+        response, modes = _responses(structure, jax.tree.map(lambda x: x[part], whole))
+        places = find_margins(response, modes, tuple(x for x in names if x in MARGINS))
+        margins = {name: place.value for name, place in places.items()}
+        return margins | _peaks_of(response, tuple(x for x in names if x in PEAKS))
 
-    with ThreadPoolExecutor(len(jax.local_devices())) as pool:
+    with threadpool_limits(1, "blas"), ThreadPoolExecutor(len(jax.local_devices())) as pool:
         judged = list(pool.map(judge, parts))
     return {name: np.concatenate([part[name] for part in judged])[:count] for name in names}
 
 
+def _peaks_of(response: SampledLoopResponse, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    return jax.tree.map(np.asarray, _figures(names, response)) if names else {}
+
+
+def find_margins(
+    response: SampledLoopResponse,
+    modes: tuple[Array, Array],
+    names: tuple[str, ...],
+    is_fine: bool = False,
+) -> dict[str, MarginPlace]:
+    """Margins of stable loops and where they are, (n,) each; NaN where a number is not finite.
+
+    Args:
+        response: leaves (n, ...).
+        modes: frequencies [rad/s] and decay [1/s] of the machines' modes, (n, k) each.
+        names: of `MARGINS`.
+        is_fine: places as exact as derivatives need.
+    """
+    # loops near the edge need more than single precision
+    response, modes = jax.tree.map(lambda x: np.asarray(x, float), (response, modes))
+    leaves = [x.reshape(len(x), -1) for x in jax.tree.leaves((response, modes))]
+    is_finite = np.all([np.isfinite(x).all(axis=1) for x in leaves], axis=0)
+    acting, count = acting_commands(response.controller), len(is_finite)
+    found = {
+        name: MarginPlace(np.full(count, np.nan), np.ones(count), np.ones(count)) for name in names
+    }
+    for pattern in np.unique(acting[is_finite], axis=0) if names else ():
+        rows = np.flatnonzero(is_finite & np.all(acting == pattern, axis=1))
+        if not pattern.any():
+            for name in names:
+                found[name].value[rows] = SEARCHES[name][1]
+            continue
+        part, (omega, decay) = jax.tree.map(lambda x, rows=rows: x[rows], (response, modes))
+        loops = loop_gains(part)
+        grid = search_grid(loops, omega, decay)
+        for name in names:
+            places = SEARCHES[name][0](loops, grid, is_fine)
+            for array, each in zip(found[name], places, strict=True):
+                array[rows] = each
+    return found
+
+
 # compiled without optimisation: it takes a fraction of the time
 @kept_jit(static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})
-def _responses(structure: Structure, cases: Case) -> SampledLoopResponse:
-    def one(case: Case) -> SampledLoopResponse:
-        loop = prepare(structure, case).loop
-        return response_of_loop(structure, case, loop, case.path.waypoints[0])
+def _responses(
+    structure: Structure, cases: Case
+) -> tuple[SampledLoopResponse, tuple[Array, Array]]:
+    return jax.vmap(lambda case: response_and_modes(structure, case, case.path.waypoints[0]))(cases)
 
-    return jax.vmap(one)(cases)
+
+def response_and_modes(
+    structure: Structure, case: Case, pose: Array
+) -> tuple[SampledLoopResponse, tuple[Array, Array]]:
+    """What `find_margins` reads of a loop about rest at a pose."""
+    response = response_of_loop(structure, case, prepare(structure, case).loop, pose)
+    modes = assembled_modes(response.plant)
+    return response, (modes.omega, modes.decay)
 
 
 @kept_jit(static_argnums=0)
 def _figures(names: tuple[str, ...], responses: SampledLoopResponse) -> dict[str, Any]:
-    return jax.lax.map(lambda response: robustness_figures(response, names), responses)
+    return jax.lax.map(lambda response: norm_peaks(response, names), responses)

@@ -51,7 +51,7 @@ def run_study(
         study: what to run.
         has_record: keep trajectories.
         has_loop: also judge the linearised sampled loop (takes seconds).
-        has_margins: also by disk, phase and delay margin (12 s the first time).
+        has_margins: also by disk, phase and delay margin (seconds the first time).
 
     Raises:
         StudyError: pose out of reach, singular path, motion longer than the run, stiff feedback.

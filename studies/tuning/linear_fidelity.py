@@ -16,17 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.frequency_response import response_of_loop
+from jaxmodel.frequency_response import SampledLoopResponse, response_of_loop
 from jaxmodel.kinematics import singularity_distance
 from jaxmodel.linear_residual import linear_residual
 from jaxmodel.loop_figures import MARGINS, PEAKS
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
-from jaxmodel.robustness import robustness_figures
+from jaxmodel.robustness import MarginPlace, margin_at, norm_peaks
 from jaxmodel.sampled_loop import LoopMatrices, closed_loop, slowest_decay, spillover
 from studies.engine.plan import padded_rows
 from studies.engine.programs import kept_jit
-from studies.engine.robustness import judge_robustness
+from studies.engine.robustness import find_margins, judge_robustness, response_and_modes
 from studies.engine.stability import gain_margin
 from studies.study.cases import as_arrays, build_case, build_structure, case_of
 from studies.study.margin import MARGIN_MODES
@@ -109,15 +109,22 @@ class LinearFidelity:
         excess = np.zeros(self._limits.shape)
         slopes = np.zeros((*excess.shape, values.shape[1]))
         for batch in self._batches.values():
+            # drop what the matrices do not depend on, to avoid a compilation
+            structure = batch.structure._replace(n_steps=1, substeps=1)
+            place, mine = self._spec.free.place, values[batch.rows]
+            margins, places = tuple(name for name in self.names if name in MARGINS), {}
+            if margins:
+                response, modes = _responses(structure, place, batch.numbers, self._pose, mine)
+                places = find_margins(response, modes, margins, is_fine=True)
             excess[batch.rows], slopes[batch.rows] = _limit_slopes(
-                # drop what the matrices do not depend on, to avoid a compilation
-                batch.structure._replace(n_steps=1, substeps=1),
+                structure,
                 self.names,
-                self._spec.free.place,
+                place,
                 batch.numbers,
                 self._pose,
                 self._limits[batch.rows],
-                values[batch.rows],
+                mine,
+                places,
             )
         return excess, slopes
 
@@ -200,6 +207,7 @@ def _excess(
     pose: Array,
     matrices: LoopMatrices,
     limits: Array,
+    places: dict[str, MarginPlace],
 ) -> Array:
     """x/(1 + |x|) for each limit, (m,): decay rates reach hundreds of their limit on both sides.
 
@@ -210,8 +218,10 @@ def _excess(
     period, excesses = case.electronics.period, []
     wanted = tuple(name for name in names if name in (*MARGINS, *PEAKS))
     if wanted:
-        loop = prepare(structure, case).loop
-        figures = robustness_figures(response_of_loop(structure, case, loop, pose), wanted)
+        response = response_of_loop(structure, case, prepare(structure, case).loop, pose)
+        figures = {name: margin_at(response, name, place) for name, place in places.items()}
+        peaks = tuple(name for name in names if name in PEAKS)
+        figures |= norm_peaks(response, peaks) if peaks else {}
         own_decay = slowest_decay(matrices.open + matrices.feedback, period)
     for k, name in enumerate(names):
         if name in wanted:
@@ -238,6 +248,19 @@ def _singularity_distance(structure: Structure, case: Case) -> Array:
     return singularity_distance(prepare(structure, case).loop.plant, pose)
 
 
+# compiled without optimisation: it takes a fraction of the time
+@kept_jit(static_argnums=(0, 1), compiler_options={"xla_backend_optimization_level": 0})
+def _responses(
+    structure: Structure, place: Any, numbers: Numbers, pose: Array, values: Array
+) -> tuple[SampledLoopResponse, tuple[Array, Array]]:
+    """What a search of margins reads of each design."""
+
+    def one(x: Array, numbers: Numbers) -> tuple[SampledLoopResponse, tuple[Array, Array]]:
+        return response_and_modes(structure, case_of(structure, place(numbers, x)), pose)
+
+    return jax.vmap(one)(values, numbers)
+
+
 @kept_jit(static_argnums=(0, 1, 2))
 def _limit_slopes(
     structure: Structure,
@@ -247,18 +270,21 @@ def _limit_slopes(
     pose: Array,
     limits: Array,
     values: Array,
+    places: dict[str, MarginPlace],
 ) -> tuple[Array, Array]:
-    def figures(x: Array, numbers: Numbers, limit: Array) -> tuple[Array, Array]:
+    def figures(
+        x: Array, numbers: Numbers, limit: Array, places: dict[str, MarginPlace]
+    ) -> tuple[Array, Array]:
         case = case_of(structure, place(numbers, x))
         matrices = closed_loop(structure, case, pose)
-        excess = _excess(structure, names, case, pose, matrices, limit)
+        excess = _excess(structure, names, case, pose, matrices, limit, places)
         return excess, excess
 
     def one(design: tuple[Any, ...]) -> tuple[Array, Array]:
         slope, excess = jax.jacrev(figures, has_aux=True)(*design)  # the figures come with it
         return excess, slope
 
-    return jax.lax.map(one, (values, numbers, limits))
+    return jax.lax.map(one, (values, numbers, limits, places))
 
 
 @kept_jit(static_argnums=(0, 1, 2, 6))
@@ -276,7 +302,7 @@ def _screen_batch(
         case = case_of(structure, place(numbers, x))
         matrices = closed_loop(structure, case, pose)
         rms = linear_residual(structure, case, matrices)
-        excess = _excess(structure, names, case, pose, matrices, limits)
+        excess = _excess(structure, names, case, pose, matrices, limits, {})
         return excess, jnp.sqrt(jnp.mean(rms[np.array(links)] ** 2))
 
     return jax.lax.map(one, values)

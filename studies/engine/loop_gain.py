@@ -1,0 +1,275 @@
+"""Loop gain of many sampled loops at many frequencies, in NumPy.
+
+The same equations as `jaxmodel.frequency_response`, where they are explained, arranged for speed:
+products of whole matrices instead of programs that take seconds to compile. Tests hold the two
+equal.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxmodel.channels import Channels
+from jaxmodel.controller import Controller
+from jaxmodel.estimator import responses
+from jaxmodel.frequency_response import (
+    IMAGES,
+    PlantResponse,
+    SampledLoopResponse,
+    tail_weights,
+)
+from jaxmodel.notch import notch_response
+from jaxmodel.return_difference import IMAGES as FEW
+from jaxmodel.state_space import StateSpace
+
+_FEW, _ALL = np.array(FEW), np.arange(-IMAGES, IMAGES + 1)
+#: Evaluations of the plant at once, which stay in a processor's cache.
+AT_ONCE = 1500
+
+
+#: Largest condition number of the eigenvectors of a controller.
+WORST = 1e6
+
+
+class ModalSystem(NamedTuple):
+    """G linear systems by their poles."""
+
+    pole: np.ndarray  # (n, G, b)
+    residue: np.ndarray  # (n, G, b, M M)
+    direct: np.ndarray  # D, (n, G, M, M)
+
+
+class LoopGains(NamedTuple):
+    """L(e^(j omega T)) = -K P of n loops at the m commands that act; NumPy."""
+
+    plant: PlantResponse  # leaves (n, ...)
+    controller: Any  # Controller; a linear system's feedback is a `ModalSystem` if it can be
+    pairs: np.ndarray  # products of a mode's rows and columns, see `_modal_sums`, (n, 3, R, p)
+    acting: np.ndarray  # numbers of the commands, (m,)
+
+    @property
+    def top(self) -> np.ndarray:
+        """Half the sample rate [rad/s], (n,)."""
+        return np.pi / self.plant.period
+
+    def part(self, rows: np.ndarray) -> LoopGains:
+        """Some of the loops, also repeated."""
+        plant, controller, pairs = jax.tree.map(lambda x: x[rows], self[:3])
+        return LoopGains(plant, controller, pairs, self.acting)
+
+    def searched(self, omega: np.ndarray) -> np.ndarray:
+        """L to 1e-4, (n, F, m, m).
+
+        Args:
+            omega: above 0 [rad/s], (n, F).
+        """
+        return self._gains(omega, np.zeros(omega.shape), is_exact=False)
+
+    def exact(self, omega: np.ndarray, delay: np.ndarray | None = None) -> np.ndarray:
+        """L with all images of the spectrum, (n, F, m, m).
+
+        Args:
+            omega: above 0 [rad/s], (n, F).
+            delay: a further one [samples], (n, F); None: none.
+        """
+        delay = np.zeros(omega.shape) if delay is None else delay
+        return self._gains(omega, delay, is_exact=True)
+
+    def at_delay(self, omega: np.ndarray, delay: np.ndarray) -> np.ndarray:
+        """L to 1e-4 with further delays, arguments as for `exact`."""
+        return self._gains(omega, delay, is_exact=False)
+
+    def _gains(self, omega: np.ndarray, delay: np.ndarray, is_exact: bool) -> np.ndarray:
+        if not omega.size:
+            return np.zeros((*omega.shape, *[len(self.acting)] * 2), complex)
+        order = _ALL if is_exact else _FEW
+        step = max(1, AT_ONCE // (omega.shape[1] * len(order)))
+        if step >= len(omega):
+            return self._evaluated(omega, delay, order)
+        parts = [np.arange(k, min(k + step, len(omega))) for k in range(0, len(omega), step)]
+        return np.concatenate(
+            [self.part(rows)._evaluated(omega[rows], delay[rows], order) for rows in parts]
+        )
+
+    def _evaluated(self, omega: np.ndarray, delay: np.ndarray, order: np.ndarray) -> np.ndarray:
+        plant = self.plant
+        period = plant.period[:, None]
+        late = (1.0 if plant.delay is None else plant.delay[:, None]) + delay
+        gain = _image_weights(late, order) * np.exp(-1j * omega * period * late)[..., None]
+        w = omega[..., None] + 2 * np.pi / period[..., None] * order  # (n, F, I)
+        flat = w.reshape(len(w), -1)
+        gain = (gain * _electronics(plant, omega, w)).reshape(flat.shape)
+        sensed = self._sensed(flat, gain, len(order))
+        feedback = _feedback(self.controller, np.exp(1j * omega * period))
+        return -feedback[..., self.acting, :] @ sensed
+
+    def _sensed(self, w: np.ndarray, gain: np.ndarray, images: int) -> np.ndarray:
+        """Sensor volts per command, see `plant_images`; images summed, (n, F, 3 K, m)."""
+        plant, k, n = self.plant, self.plant.sensor.shape[2], len(w)
+        square = w * w
+        blocks = self._modal_sums(w)  # (n, 3, N, K + 3, K + 3)
+        at = (..., None, None)
+        dynamic = (1j * w)[at] * plant.damping[:, None] + (
+            plant.stiffness[:, None] - square[at] * plant.mass[:, None]
+        )
+        dynamic = dynamic - (square * square)[at] * blocks[..., k:, k:].sum(axis=1)
+        compliance = (gain * square * square)[at] * inverse_3(dynamic)
+        leaving = blocks[..., :k, k:].transpose(0, 2, 1, 3, 4).reshape(n, -1, 3 * k, 3)
+        entering = blocks[..., k:, :k].transpose(0, 2, 3, 1, 4).reshape(n, -1, 3, 3 * k)
+        leaving = (leaving @ compliance).reshape(n, -1, images, 3 * k, 3)
+        # the sum over images and pose is one product
+        left = leaving.transpose(0, 1, 3, 2, 4).reshape(n, -1, 3 * k, 3 * images)
+        sensed = left @ entering[..., self.acting].reshape(n, -1, 3 * images, len(self.acting))
+        own = gain[:, None, :, None, None] * (blocks[..., :k, :k] + plant.direct[:, :, None])
+        own = own.reshape(n, 3, -1, images, k, k).sum(axis=3)
+        whole = np.zeros((*sensed.shape[:3], 3 * k), complex)
+        for i in range(3):
+            rows = slice(i * k, (i + 1) * k)
+            whole[..., rows, rows] = own[:, i]
+        return sensed + whole[..., self.acting]
+
+    def _modal_sums(self, w: np.ndarray) -> np.ndarray:
+        """Sums over the modes of each link at j w, (n, 3, N, K + 3, K + 3).
+
+        Rows are sensors and forces on the pose, columns actuators and motions of the pose. Real and
+        imaginary parts are multiplied by real matrices, which takes half the time.
+        """
+        plant, count = self.plant, w.shape[1]
+        w = w[:, None, :, None]
+        stiff = plant.square[:, :, None] - w * w  # (n, 3, N, R)
+        loss = plant.decay[:, :, None] * w
+        size = 1 / (stiff * stiff + loss * loss)
+        both = np.concatenate([stiff * size, -loss * size], axis=2) @ self.pairs
+        whole = both[:, :, :count] + 1j * both[:, :, count:]
+        side = plant.sensor.shape[2] + 3
+        return whole.reshape(*whole.shape[:3], side, side)
+
+
+def loop_gains(response: SampledLoopResponse) -> LoopGains:
+    """Loop gains by frequency responses, leaves (n, ...), NumPy in float64."""
+    plant = response.plant
+    rows = np.concatenate([plant.sensor, plant.enter], axis=2)  # (n, 3, K + 3, R)
+    columns = np.concatenate([np.swapaxes(plant.actuator, 2, 3), plant.leave], axis=2)
+    pairs = np.einsum("niar,nibr->nirab", rows, columns)
+    probe = np.exp(1j * np.array([0.3, 3.0]))
+    seen = _feedback(response.controller, np.broadcast_to(probe, (len(rows), 2)))
+    acting = np.flatnonzero(np.any(seen != 0, axis=(0, 1, 3)))
+    controller: Any = response.controller
+    if isinstance(controller.feedback, StateSpace):
+        controller = controller._replace(feedback=_modal_form(controller.feedback))
+    return LoopGains(plant, controller, pairs.reshape(*pairs.shape[:3], -1), acting)
+
+
+def acting_commands(controller: Controller) -> np.ndarray:
+    """Which commands act, (n, 3 K)."""
+    n = len(controller.voltage_limit)
+    seen = _feedback(controller, np.broadcast_to(np.exp(1j * np.array([0.3, 3.0])), (n, 2)))
+    return np.any(seen != 0, axis=(1, 3))
+
+
+def _image_weights(late: np.ndarray, order: np.ndarray) -> np.ndarray:
+    """See `jaxmodel.frequency_response.image_weights`, (n, F, I)."""
+    turn = 2 * np.pi * late[..., None]
+    weights = np.exp(-1j * turn * order)
+    if len(order) < len(_ALL):
+        return weights
+    even, odd = tail_weights()
+    beyond = np.arange(IMAGES + 1, IMAGES + 1 + len(even))
+    return weights + np.cos(turn * beyond) @ even - 1j * (np.sin(turn * beyond) @ odd)
+
+
+def _electronics(plant: PlantResponse, omega: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Hold, amplifier, patches and anti-alias filter, (n, F, I)."""
+
+    def spread(x: np.ndarray) -> np.ndarray:
+        return np.asarray(x)[:, None, None]
+
+    s, corner = 1j * w, spread(plant.antialias)
+    held = (1 - np.exp(-1j * omega * plant.period[:, None]))[..., None] / spread(plant.period)
+    gain = held * corner**2 / (corner**2 - w * w + np.sqrt(2.0) * corner * s) / s
+    if plant.highpass is not None:
+        gain = gain * s / (s + spread(plant.highpass))
+    if plant.lag is not None:
+        gain = gain / (1 + s * spread(plant.lag))
+    return gain
+
+
+def _feedback(controller: Any, z: np.ndarray) -> np.ndarray:
+    """See `jaxmodel.frequency_response.controller_response`, (n, F, 3 K, 3 K)."""
+    feedback, through, notch = controller.feedback, controller.feedthrough, controller.notch
+    if isinstance(feedback, Channels):
+        estimator = jax.tree.map(lambda x: x[:, None], feedback.estimator)
+        rate, value = responses(estimator, z[..., None, None])
+        force = feedback.velocity_gain[:, None] * rate
+        if feedback.position_gain is not None:
+            force = force + feedback.position_gain[:, None] * value
+        into = feedback.synthesizer[:, None] * force[..., None, :]
+        blocks = -into @ feedback.filter[:, None]
+    else:
+        blocks = _transfer(feedback, z)
+    groups, m = blocks.shape[2:4]
+    if notch is not None:
+        coefficients = jax.tree.map(lambda x: x[:, None], notch)
+        passed = np.asarray(notch_response(coefficients, z[..., None]))  # (n, F, 3)
+        columns = np.repeat(passed, through.shape[2], axis=2)
+        blocks = blocks * columns.reshape(*z.shape, groups, 1, m)
+    if np.any(through):
+        own = through if groups == 3 else block_diagonal(through)[:, None]
+        late = own[:, None] / z[..., None, None, None]
+        blocks = np.linalg.solve(np.eye(m) + blocks @ late, blocks)
+    return block_diagonal(blocks)
+
+
+def _transfer(system: StateSpace | ModalSystem, z: np.ndarray) -> np.ndarray:
+    """C (z - A)^-1 B + D, (n, F, G, M, M)."""
+    if isinstance(system, ModalSystem):
+        n, groups, count = system.pole.shape
+        share = 1 / (z[:, None, :, None] - system.pole[:, :, None])  # (n, G, F, b)
+        moved = (share @ system.residue).reshape(n, groups, -1, *system.direct.shape[2:])
+        return np.swapaxes(moved, 1, 2) + system.direct[:, None]
+    eye = np.eye(system.state.shape[-1])
+    enter = system.enter[:, None] + 0j
+    state = np.linalg.solve(z[..., None, None, None, None] * eye - system.state[:, None], enter)
+    leave = np.swapaxes(system.leave, 2, 3)[:, None]  # (n, 1, G, N, M, b)
+    return np.sum(leave @ state, axis=3) + system.direct[:, None]
+
+
+def _modal_form(system: StateSpace) -> StateSpace | ModalSystem:
+    """The system by its poles, unless they are too close together for that."""
+    pole, shape = np.linalg.eig(system.state + 0j)  # (n, G, N, b), (n, G, N, b, b)
+    # units of the states do not matter
+    alike = shape / np.linalg.norm(shape, axis=-1, keepdims=True)
+    if not np.all(np.linalg.cond(alike / np.linalg.norm(alike, axis=-2, keepdims=True)) < WORST):
+        return system
+    into = np.linalg.inv(shape) @ system.enter  # (n, G, N, b, M)
+    out = np.swapaxes(system.leave, 2, 3) @ shape  # (n, G, N, M, b)
+    residue = np.einsum("ngkmb,ngkbl->ngkbml", out, into)
+    n, groups = pole.shape[:2]
+    m = system.direct.shape[-1]
+    return ModalSystem(
+        pole.reshape(n, groups, -1), residue.reshape(n, groups, -1, m * m), system.direct
+    )
+
+
+def inverse_3(matrix: np.ndarray) -> np.ndarray:
+    """Of matrices (..., 3, 3), by cofactors."""
+    a, b, c = (matrix[..., k, :] for k in range(3))
+
+    def crossed(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        each = [x[..., k - 2] * y[..., k - 1] - x[..., k - 1] * y[..., k - 2] for k in range(3)]
+        return np.stack(each, axis=-1)
+
+    columns = np.stack([crossed(b, c), crossed(c, a), crossed(a, b)], axis=-1)
+    return columns / np.sum(a * columns[..., 0], axis=-1)[..., None, None]
+
+
+def block_diagonal(blocks: np.ndarray) -> np.ndarray:
+    """(..., G, m, m) to (..., G m, G m)."""
+    *outer, groups, m, _ = blocks.shape
+    whole = np.zeros((*outer, groups * m, groups * m), blocks.dtype)
+    for g in range(groups):
+        whole[..., g * m : (g + 1) * m, g * m : (g + 1) * m] = blocks[..., g, :, :]
+    return whole
