@@ -176,8 +176,8 @@ def controller_step(
 def linear_law(controller: Controller) -> tuple[Array, Array, Array, Array]:
     """The controller without ADC and limits, as a linear system.
 
-    x[k+1] = A x[k] + B (y, v)[k] and m[k] = C x[k] + D (y, v)[k], with sensor voltages y, commands m
-    and those of the sample before, v[k+1] = m[k].
+    x[k+1] = A x[k] + B (y, v)[k] and m[k] = C x[k] + D (y, v)[k], with sensor voltages y,
+    commands m and those of the sample before, v[k+1] = m[k].
 
     Args:
         controller: without rival channels, see `linear_parts`.

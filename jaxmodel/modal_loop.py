@@ -13,7 +13,7 @@ import numpy as np
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, linear_law
 from jaxmodel.discs import Disc
-from jaxmodel.lazy import jax, jnp
+from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import patch_ends
 from jaxmodel.prepare import prepare
