@@ -39,7 +39,7 @@ test: .venv/installed  ## run the tests
 	$(PYTEST)
 
 test-long: .venv/installed  ## run the long campaigns
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[twin]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[twin,robust]'
 	$(PYTEST) -m long
 
 smoke: .venv/installed  ## run the wheel's main job on every supported Python here, core tests on the others

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from jaxmodel.channels import Channels
 from jaxmodel.estimator import FilterState
-from jaxmodel.lazy import jnp
+from jaxmodel.lazy import jax, jnp
 from jaxmodel.notch import Notch, NotchState, advance_notch
 from jaxmodel.parameters import Array
 from jaxmodel.state_space import StateSpace
@@ -171,3 +171,33 @@ def controller_step(
     command = soft_limit(demand, controller.voltage_limit, is_smooth)
     after = controller.feedback.limited(after, command - demand)
     return ControllerState(after, command, notch), ControllerInfo(measured, command, is_clipped)
+
+
+def linear_law(controller: Controller) -> tuple[Array, Array, Array, Array]:
+    """The controller without ADC and limits, as a linear system.
+
+    x[k+1] = A x[k] + B (y, v)[k] and m[k] = C x[k] + D (y, v)[k], with sensor voltages y,
+    commands m and those of the sample before, v[k+1] = m[k].
+
+    Args:
+        controller: without rival channels, see `linear_parts`.
+
+    Returns:
+        A, (n, n); B, (n, 6 K); C, (3 K, n); D, (3 K, 6 K).
+    """
+    from jax.flatten_util import ravel_pytree
+
+    start = rest_controller(controller)
+    rest, unpack = ravel_pytree((start.feedback, start.notch))
+    applied = jnp.zeros(start.voltage.shape)
+    width = applied.size
+
+    def step(x: Array, ports: Array) -> tuple[Array, Array]:
+        measured, held = (jnp.reshape(part, applied.shape) for part in jnp.split(ports, 2))
+        feedback, notch = unpack(x)
+        before = ControllerState(feedback, held, notch)
+        after, info = controller_step(controller, before, measured, None, True)
+        return ravel_pytree((after.feedback, after.notch))[0], jnp.ravel(info.command)
+
+    (a, b), (c, d) = jax.jacfwd(step, (0, 1))(jnp.zeros_like(rest), jnp.zeros(2 * width))
+    return a, b, c, d

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.controller import Controller, ControllerState, controller_step, rest_controller
+from jaxmodel.controller import Controller, linear_law
 from jaxmodel.discs import Disc
-from jaxmodel.lazy import jax, jnp
+from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import patch_ends
 from jaxmodel.prepare import prepare
@@ -91,7 +91,7 @@ def modal_loop(structure: Structure, case: Case, pose: Array, law: Controller) -
         actuator=loop.actuator,
         steepest=_steepest_slopes(case, loop.sensor, loop.actuator),
         exact=exact,
-        law=_linear_law(law),
+        law=linear_law(law),
         period=jnp.asarray(case.electronics.period),
         antialias=jnp.asarray(case.electronics.antialias),
         highpass=case.electronics.sensor_highpass if structure.has_sensor_highpass else None,
@@ -115,26 +115,6 @@ def _steepest_slopes(case: Case, sensor: Array, actuator: Array) -> tuple[Array,
 
     by_patch = jnp.swapaxes(actuator, 1, 2)
     return steepest(sensor, patches.sensor_length), steepest(by_patch, patches.actuator_length)
-
-
-def _linear_law(law: Controller) -> tuple[Array, Array, Array, Array]:
-    """A, B, C, D of a controller, see `ModalLoop`."""
-    from jax.flatten_util import ravel_pytree
-
-    start = rest_controller(law)
-    rest, unpack = ravel_pytree((start.feedback, start.notch))
-    applied = jnp.zeros(start.voltage.shape)
-    width = applied.size
-
-    def step(x: Array, ports: Array) -> tuple[Array, Array]:
-        measured, held = (jnp.reshape(part, applied.shape) for part in jnp.split(ports, 2))
-        feedback, notch = unpack(x)
-        before = ControllerState(feedback, held, notch)
-        after, info = controller_step(law, before, measured, None, True)
-        return ravel_pytree((after.feedback, after.notch))[0], jnp.ravel(info.command)
-
-    (a, b), (c, d) = jax.jacfwd(step, (0, 1))(jnp.zeros_like(rest), jnp.zeros(2 * width))
-    return a, b, c, d
 
 
 class LawPoles(NamedTuple):

@@ -20,7 +20,7 @@ from .fitting.spec import load_fit
 from .laws.run import run_laws
 from .paper.run import run_paper
 from .show.document import schema
-from .single.plant import plant_of, write_plant
+from .single.plant import controller_of, plant_of, write_system
 from .single.run import replay, simulate
 from .space.spec import load_sweep, parse_sweep
 from .spillover.run import spillover_design
@@ -52,6 +52,7 @@ __all__ = [
     "cache_contents",
     "chord_deflection",
     "configure",
+    "controller_of",
     "explore_results",
     "export_design",
     "extend",
@@ -87,9 +88,9 @@ __all__ = [
     "status_rows",
     "twin_design",
     "verify_study",
-    "write_plant",
     "write_study",
     "write_sweep_report",
+    "write_system",
 ]
 
 __version__: str

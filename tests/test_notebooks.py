@@ -18,14 +18,17 @@ NOTEBOOKS = {
     path.stem: path for path in sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 }
 #: Much to compile; in short: the same functions in test_sweeps, test_tuning, test_atlas,
-#: test_spillover and test_export.
+#: test_spillover, test_export and test_robust.
 LONG = (
     "2_coupling",
     "3_placement_sweep",
     "4_gradient_tuning",
     "5_spillover",
     "6_from_design_to_c",
+    "7_python_control",
 )
+#: Packages of an extra that a notebook needs.
+NEEDS = {"7_python_control": ("control", "ctrlsys")}
 QUICK = [name for name in NOTEBOOKS if name not in LONG]
 
 
@@ -37,6 +40,7 @@ def test_there_are_notebooks():
         "4_gradient_tuning",
         "5_spillover",
         "6_from_design_to_c",
+        "7_python_control",
     ]
 
 
@@ -85,6 +89,8 @@ def test_notebook_runs(executed, name):
 @pytest.mark.long
 @pytest.mark.parametrize("name", LONG)
 def test_long_notebook_runs(name):
+    for package in NEEDS.get(name, ()):
+        pytest.importorskip(package, reason="extra robust: pip install '.[robust]'")
     book = read(name)
     execute(book)
     check_outputs(book)

@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
+from jaxmodel.frequency_response import controller_response
 from jaxmodel.parameters import HOME
+from jaxmodel.prepare import prepare
 from studies.engine.preflight import check_run
+from studies.engine.runs import run_study
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
-from studies.single.plant import plant_of, write_plant
+from studies.single.plant import controller_of, plant_of, write_system
+from studies.study.cases import as_arrays
 from studies.study.spec import parse_study
 from tests.test_cli import refused, run
 from tests.test_state_space import PERIOD, SHORT, study_with, thirty  # noqa: F401
@@ -65,7 +69,7 @@ def test_files_hold_the_same(tmp_path, end):
     study = parse_study(SHORT)
     plant = plant_of(study)
     path = tmp_path / f"plant.{end}"
-    write_plant(plant, path)
+    write_system(plant, path)
     if end == "npz":
         with np.load(path) as read:
             data = dict(read)
@@ -91,3 +95,32 @@ def test_the_command(tmp_path, capsys):
     assert "cannot write there" in said and "create it first" in said
     with pytest.raises(StudyError, match="control.feedback = 'none'; allowed: 'sampled'"):
         plant_of(parse_study(SHORT | {"control": {"feedback": "none"}}))
+
+
+@pytest.mark.parametrize(
+    "control", [{}, {"law": "lqg"}, {"feedthrough_factor": 0.7, "notch_hz": [0.0, 800.0, 0.0]}]
+)
+def test_a_controller_is_the_same_system_in_either_form(control):
+    study = parse_study(SHORT | {"control": control})
+    system = controller_of(study)
+    structure, case = check_run(study)
+    controller = prepare(structure, as_arrays(case)).loop.controller
+    for z in np.exp(2j * np.pi * PERIOD * np.array([20.0, 114.0, 460.0, 3000.0])):
+        states = np.linalg.solve(z * np.eye(len(system.a)) - system.a, system.b + 0j)
+        wanted = controller_response(controller, z)
+        np.testing.assert_allclose(system.c @ states + system.d, wanted, rtol=1e-9, atol=1e-9)
+
+
+def test_a_controller_comes_back_from_its_file(tmp_path):
+    study = parse_study(SHORT)
+    write_system(controller_of(study), tmp_path / "imsc.npz")
+    again = study_with(tmp_path / "imsc.npz")
+    first, second = (run_study(x).result.metrics.residual_rms for x in (study, again))
+    np.testing.assert_allclose(second, first, rtol=1e-6)
+
+
+def test_a_law_that_switches_is_no_linear_system():
+    with pytest.raises(
+        StudyError, match="control.law = 'modified_imsc'; allowed: a law whose channels"
+    ):
+        controller_of(parse_study(SHORT | {"control": {"law": "modified_imsc"}}))

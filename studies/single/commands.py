@@ -136,10 +136,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         """Write the sampled linear plant of a design, for a controller designed elsewhere."""
         start()
         from studies.engine.design import load_design
-        from studies.single.plant import plant_of, write_plant
+        from studies.single.plant import plant_of, write_system
 
         found = plant_of(load_design(design, case).study)
-        write_plant(found, out)
+        write_system(found, out)
         console.print(
             f"{len(found.a)} states, {len(found.inputs)} actuators to {len(found.outputs)} "
             f"sensors, {1e6 * found.sample_time:g} µs a sample; written: {out}",

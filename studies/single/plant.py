@@ -1,4 +1,4 @@
-"""`studies plant`: the sampled linear plant of a design, for controllers designed elsewhere."""
+"""`studies plant`: the sampled linear plant of a design, and its controller, for use elsewhere."""
 
 from __future__ import annotations
 
@@ -10,9 +10,14 @@ import jax
 import numpy as np
 
 from jaxmodel.case import Case, Structure
+from jaxmodel.controller import linear_law
+from jaxmodel.laws import LAWS
+from jaxmodel.parameters import Array
+from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import SampledPlant, sampled_plant
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
+from studies.engine.runs import resolved_study
 from studies.errors import field_error
 from studies.publish import replacing
 from studies.show.document import plain
@@ -20,15 +25,20 @@ from studies.study.spec import Study
 from studies.study.state_space import FORMATS
 
 
-class NamedPlant(NamedTuple):
-    """A discrete-time plant with names of its inputs and outputs; D is zero."""
+class NamedSystem(NamedTuple):
+    """A linear discrete-time system between commands and sensors, with names of its ports.
+
+    "actuator LINK.PATCH" is a command [V], "sensor LINK.PATCH" a voltage behind the anti-alias
+    filter [V].
+    """
 
     a: np.ndarray  # (n, n)
     b: np.ndarray  # (n, 3 K)
     c: np.ndarray  # (3 K, n)
+    d: np.ndarray  # (3 K, 3 K)
     sample_time: float  # [s]
-    inputs: tuple[str, ...]  # "actuator LINK.PATCH", commands [V]
-    outputs: tuple[str, ...]  # "sensor LINK.PATCH", behind the anti-alias filter [V]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
 
 
 @kept_jit(static_argnums=0)
@@ -36,7 +46,7 @@ def _plant(structure: Structure, case: Case, pose: np.ndarray) -> SampledPlant:
     return sampled_plant(structure, case, pose)
 
 
-def plant_of(study: Study) -> NamedPlant:
+def plant_of(study: Study) -> NamedSystem:
     """The plant from commands of the actuators to what the converters see, over one sample.
 
     Linearised at the first way-point, with hold, amplifiers, anti-alias filter and the sample of
@@ -46,7 +56,7 @@ def plant_of(study: Study) -> NamedPlant:
         study: with sampled feedback.
 
     Returns:
-        NamedPlant.
+        NamedSystem; D is zero.
 
     Raises:
         StudyError: nothing is sampled, or the study cannot run.
@@ -55,29 +65,82 @@ def plant_of(study: Study) -> NamedPlant:
         >>> plant_of(paper_study()).inputs[0]
         'actuator 1.1'
     """
-    if study.control.feedback != "sampled":
-        raise field_error("control.feedback", study.control.feedback, "'sampled'")
+    _check_sampled(study)
     structure, case = check_run(study)
     pose = np.array(study.motion.waypoints[0], float)
     found = jax.tree.map(np.asarray, _plant(structure._replace(n_steps=1, substeps=1), case, pose))
-    ports = [f"{i + 1}.{k + 1}" for i in range(3) for k in range(structure.n_patches)]
-    return NamedPlant(
+    actuators, sensors = _ports(structure)
+    return NamedSystem(
         a=found.state,
         b=found.enter,
         c=found.leave,
+        d=np.zeros((len(found.leave), found.enter.shape[1])),
         sample_time=1 / study.electronics.sample_rate_hz,
-        inputs=tuple(f"actuator {port}" for port in ports),
-        outputs=tuple(f"sensor {port}" for port in ports),
+        inputs=actuators,
+        outputs=sensors,
     )
 
 
-def write_plant(plant: NamedPlant, path: str | Path) -> None:
-    """Write a plant as NPZ, MAT or JSON, by the ending of the file.
+@kept_jit(static_argnums=0)
+def _law(structure: Structure, case: Case) -> tuple[Array, Array, Array, Array]:
+    return linear_law(prepare(structure, case).loop.controller)
+
+
+def controller_of(study: Study) -> NamedSystem:
+    """The controller of a study, of any law, as a linear system from sensors to commands.
+
+    ADC and limits are left out. What `control.law = "state_space"` reads back acts alike.
+
+    Args:
+        study: with sampled feedback.
+
+    Returns:
+        NamedSystem.
+
+    Raises:
+        StudyError: nothing is sampled, the law switches its channels, or the study cannot run.
+
+    Example:
+        >>> controller_of(paper_study()).inputs[0]
+        'sensor 1.1'
+    """
+    _check_sampled(study)
+    if LAWS[study.control.law].is_switching:
+        raise field_error("control.law", study.control.law, "a law whose channels act all at once")
+    structure, case = check_run(resolved_study(study))
+    law = _law(structure._replace(n_steps=1, substeps=1), case)
+    a, b, c, d = (np.asarray(part) for part in law)
+    n = len(c)  # the commands of the sample before are states, too
+    actuators, sensors = _ports(structure)
+    return NamedSystem(
+        a=np.block([[a, b[:, n:]], [c, d[:, n:]]]),
+        b=np.vstack([b[:, :n], d[:, :n]]),
+        c=np.hstack([c, d[:, n:]]),
+        d=d[:, :n],
+        sample_time=1 / study.electronics.sample_rate_hz,
+        inputs=sensors,
+        outputs=actuators,
+    )
+
+
+def _check_sampled(study: Study) -> None:
+    if study.control.feedback != "sampled":
+        raise field_error("control.feedback", study.control.feedback, "'sampled'")
+
+
+def _ports(structure: Structure) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of actuators and of sensors."""
+    ports = [f"{i + 1}.{k + 1}" for i in range(3) for k in range(structure.n_patches)]
+    return tuple(f"actuator {x}" for x in ports), tuple(f"sensor {x}" for x in ports)
+
+
+def write_system(system: NamedSystem, path: str | Path) -> None:
+    """Write a plant or a controller as NPZ, MAT or JSON, by the ending of the file.
 
     The names are those that `[state_space]` reads: A, B, C, D, dt, inputs, outputs.
 
     Args:
-        plant: from `plant_of`.
+        system: from `plant_of` or `controller_of`.
         path: of the file.
 
     Raises:
@@ -86,9 +149,8 @@ def write_plant(plant: NamedPlant, path: str | Path) -> None:
     path = Path(path)
     if path.suffix.lower() not in FORMATS:
         raise field_error("--out", str(path), f"a file {', '.join(FORMATS)}")
-    direct = np.zeros((len(plant.c), plant.b.shape[1]))
-    content: dict[str, Any] = {"A": plant.a, "B": plant.b, "C": plant.c, "D": direct}
-    content |= {"dt": plant.sample_time, "inputs": plant.inputs, "outputs": plant.outputs}
+    content: dict[str, Any] = {"A": system.a, "B": system.b, "C": system.c, "D": system.d}
+    content |= {"dt": system.sample_time, "inputs": system.inputs, "outputs": system.outputs}
     with replacing(path) as temporary, open(temporary, "wb") as file:
         _write(content, path.suffix.lower(), file)
 
