@@ -298,6 +298,7 @@ STRONG = {"imsc": 3.0, "lqg": 1.0}
 DEFLECTED = {"load_deflection": (1e-5, 1e-5, -1e-5)}
 
 
+@pytest.mark.long
 def test_a_design_is_tuned_at_its_delay():
     """Downhill, by derivatives that are those of differences, and not as at another delay."""
     evaluators, at = [], []

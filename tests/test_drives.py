@@ -217,7 +217,8 @@ def test_kernel_equals_scan(name):
     check_equal(fast, reference)
 
 
-@pytest.mark.parametrize("name", short_ones(SAMPLED, ["super_twisting"]))
+@pytest.mark.long
+@pytest.mark.parametrize("name", SAMPLED)
 def test_gradients_by_a_drives_own_numbers_equal_differences(name):
     study = study_of(
         name, run__smooth=True, drive__coulomb_friction=0.5, drive__friction_speed=0.05

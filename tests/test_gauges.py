@@ -152,6 +152,7 @@ def test_verification_of_the_links_knows_gauges(basis):
         assert row.left_out or row.difference <= row.allowed, row
 
 
+@pytest.mark.long
 def test_slopes_of_a_run_are_those_of_differences():
     """Of residual vibration, by the gauges' length and noise."""
     study = parse_study(
