@@ -78,8 +78,8 @@ def law_candidates(study: Study) -> list[Contender]:
             continue
         one = _law_candidate(study, law)
         found.append(one)
-        if RATIOS in one.free and name == study.control.law:
-            fixed = {field: x for field, x in one.free.items() if field != RATIOS}
+        fixed = {field: x for field, x in one.free.items() if not field.startswith(RATIOS)}
+        if len(fixed) < len(one.free) and name == study.control.law:
             found.append(one._replace(name=f"{law.text}, {AS_GIVEN}", free=fixed))
     return found
 
@@ -95,7 +95,9 @@ def _law_candidate(study: Study, law: Law) -> Contender:
         settings["control.velocity_gain"] = tuple(gains.tolist())
         own = plain.study(study)
     free = {GAIN: around(own.control.gain_factor)}
-    free |= {name: bounds for name, bounds in SHARED.items() if _depends(own, name)}
+    for field, bounds in SHARED.items():
+        names = _entries(field, known_field(field, own, "laws"))
+        free |= {name: bounds for name in names if _depends(own, name)}
     free |= {f"control.laws.{law.name}.{x.name}": parameter_range(x) for x in law.parameters}
     return plain._replace(free=free)
 
@@ -157,11 +159,17 @@ def _strength(structure: Structure, case: Case) -> Array:
     return jnp.sum(drives * sees, axis=1)
 
 
+def _entries(name: str, value: Any) -> list[str]:
+    """Names of the numbers in a field, which may be a list."""
+    if not isinstance(value, tuple):
+        return [name]
+    return [entry for k, x in enumerate(value) for entry in _entries(f"{name}[{k}]", x)]
+
+
 def _depends(study: Study, name: str) -> bool:
     """Whether the study's controller depends on a setting."""
     value = known_field(name, study, "laws")
-    nudged = jax.tree.map(lambda x: NUDGE * x, value)
-    changed = parse_study(set_value(study, name, nudged))
+    changed = parse_study(set_value(study, name, NUDGE * value))
     try:
         pairs = zip(*map(_leaves, (study, changed)), strict=True)
     except StudyError:  # this design is not one; its tuning says why
