@@ -154,9 +154,7 @@ def loop_gains(response: SampledLoopResponse) -> LoopGains:
     rows = np.concatenate([plant.sensor, plant.enter], axis=2)  # (n, 3, K + 3, R)
     columns = np.concatenate([np.swapaxes(plant.actuator, 2, 3), plant.leave], axis=2)
     pairs = np.einsum("niar,nibr->nirab", rows, columns)
-    probe = np.exp(1j * np.array([0.3, 3.0]))
-    seen = _feedback(response.controller, np.broadcast_to(probe, (len(rows), 2)))
-    acting = np.flatnonzero(np.any(seen != 0, axis=(0, 1, 3)))
+    acting = np.flatnonzero(acting_commands(response.controller).any(axis=0))
     controller: Any = response.controller
     if isinstance(controller.feedback, StateSpace):
         controller = controller._replace(feedback=_modal_form(controller.feedback))

@@ -18,7 +18,6 @@ import numpy as np
 from jaxmodel.case import Case, Structure
 from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
-from jaxmodel.laws.imsc import IMSC
 from jaxmodel.loci import (
     AxisCrossing,
     FrequencyPoint,
@@ -44,7 +43,7 @@ from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 from studies.engine.damping import damping_ratios, least_controlled
 from studies.engine.lanes import BLOCK, run_steps
 from studies.engine.programs import kept_jit
-from studies.engine.stability import LoopFigures, loop_report, with_margin_modes
+from studies.engine.stability import LoopFigures, loop_report, modes_alone, with_margin_modes
 from studies.study.margin import HIGHEST, LOWEST
 
 
@@ -172,12 +171,7 @@ def _judge_by_eigenvalues(structure: Structure, case: Case, figures: LoopFigures
 
 def _judge_one_by_one(structure: Structure, cases: Case) -> LoopFigures:
     """Worst figures of loops whose controlled modes act one at a time, each judged alone."""
-    alone = structure._replace(law=IMSC.name)
-    parts = []
-    for j in range(structure.n_controlled):
-        mask = cases.control.mode_mask * (np.arange(structure.n_controlled) == j)
-        control = cases.control._replace(mode_mask=mask)
-        parts.append(judge_loops(alone, cases._replace(control=control)))
+    parts = [judge_loops(*alone) for alone in modes_alone(structure, cases)]
     margins = np.stack([part.gain_margin for part in parts])
     worst = np.argmin(np.where(np.isnan(margins), -np.inf, margins), axis=0)[None]
 

@@ -18,7 +18,6 @@ from threadpoolctl import threadpool_limits
 from jaxmodel.case import Case, Structure
 from jaxmodel.frequency_response import SampledLoopResponse, response_of_loop
 from jaxmodel.laws import LAWS
-from jaxmodel.laws.imsc import IMSC
 from jaxmodel.loop_figures import MARGINS, MOST_DELAY, MOST_PHASE, PEAKS
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
@@ -30,7 +29,7 @@ from studies.engine.loop_gain import LoopGains, acting_commands, loop_gains
 from studies.engine.margin_grid import GridGain, search_grid
 from studies.engine.plan import padded_rows
 from studies.engine.programs import kept_jit
-from studies.engine.stability import with_margin_modes
+from studies.engine.stability import modes_alone, with_margin_modes
 
 #: Loops per call; each core takes one call after another.
 BATCH = 8
@@ -79,11 +78,7 @@ def _of_parts(
 ) -> dict[str, np.ndarray]:
     if not LAWS[structure.law].is_switching:
         return _figures_of(structure, cases, names, count)
-    alone, parts = structure._replace(law=IMSC.name), []
-    for j in range(structure.n_controlled):
-        mask = cases.control.mode_mask * (np.arange(structure.n_controlled) == j)
-        part = cases._replace(control=cases.control._replace(mode_mask=mask))
-        parts.append(_figures_of(alone, part, names, count))
+    parts = [_figures_of(*alone, names, count) for alone in modes_alone(structure, cases)]
     worst = {True: np.min, False: np.max}
     return {name: worst[name in MARGINS]([part[name] for part in parts], axis=0) for name in names}
 

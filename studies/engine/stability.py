@@ -19,6 +19,7 @@ from jaxmodel.axial import axial_force
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, linear_parts
 from jaxmodel.laws import LAWS
+from jaxmodel.laws.imsc import IMSC
 from jaxmodel.linear import Moment, resting
 from jaxmodel.motion import PathSample, end_of_path, sample_path
 from jaxmodel.parameters import Array
@@ -88,6 +89,14 @@ def with_margin_modes(
         has_position_gain=True,
     )
     return structure, case
+
+
+def modes_alone(structure: Structure, cases: Case) -> list[tuple[Structure, Case]]:
+    """Loops of a law whose controlled modes act one at a time: those of each mode by itself."""
+    modes, alone = np.arange(structure.n_controlled), structure._replace(law=IMSC.name)
+    control = cases.control
+    masks = (control.mode_mask * (modes == j) for j in modes)
+    return [(alone, cases._replace(control=control._replace(mode_mask=mask))) for mask in masks]
 
 
 class _Loops(NamedTuple):
