@@ -126,7 +126,7 @@ def test_budget_from_the_command_line():
 
 
 def tuned(candidate, study):
-    return Tuned(candidate=candidate, study=study, reason="", objective=1.0, n_free=1, runs=8)
+    return Tuned(candidate, study, "", 1)
 
 
 def test_a_comparison_writes_a_page_whose_order_is_that_of_the_runs(tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ study's common settings that its controller depends on.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -26,7 +27,8 @@ from studies.engine.controller import fixed_controller
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
 from studies.errors import StudyError
-from studies.study.paths import known_field, set_value
+from studies.space.free import numbers_in
+from studies.study.paths import known_field, set_value, set_values
 from studies.study.spec import Study, parse_study
 
 #: Numbers are searched within this factor of their start, parameters inside their allowed range;
@@ -59,9 +61,7 @@ class Contender(NamedTuple):
 
     def study(self, study: Study) -> Study:
         """The design with this candidate in place of its own."""
-        for name, value in self.settings.items():
-            study = parse_study(set_value(study, name, value))
-        return study
+        return parse_study(set_values(study, self.settings))
 
 
 def law_candidates(study: Study) -> list[Contender]:
@@ -95,9 +95,8 @@ def _law_candidate(study: Study, law: Law) -> Contender:
         settings["control.velocity_gain"] = tuple(gains.tolist())
         own = plain.study(study)
     free = {GAIN: around(own.control.gain_factor)}
-    for field, bounds in SHARED.items():
-        names = _entries(field, known_field(field, own, "laws"))
-        free |= {name: bounds for name in names if _depends(own, name)}
+    shared = {name: bounds for field, bounds in SHARED.items() for name in _entries(own, field)}
+    free |= {name: shared[name] for name in _decisive(own, shared, _of_controller)}
     free |= {f"control.laws.{law.name}.{x.name}": parameter_range(x) for x in law.parameters}
     return plain._replace(free=free)
 
@@ -116,22 +115,10 @@ def _drive_candidate(study: Study, law: DriveLaw) -> Contender:
     plain = Contender(law.text, settings, {}, OF_DRIVES, is_drive=True)
     own = plain.study(study)
     gains = {"drive.kp": own.drive.kp, "drive.kd": own.drive.kd}
-    free = {name: around(x, share=SERVO) for name, x in gains.items() if _serves(own, name)}
+    free = {name: around(gains[name], share=SERVO) for name in _decisive(own, gains, _of_drive)}
     for x in law.parameters:
         free[f"drive.kinds.{law.name}.{x.name}"] = parameter_range(x, SERVO)
     return plain._replace(free=free)
-
-
-def _serves(study: Study, name: str) -> bool:
-    """Whether the study's drive depends on one of its gains."""
-    value = known_field(name, study, "laws")
-    changed = parse_study(set_value(study, name, NUDGE * value))
-
-    def gains(one: Study) -> list[Any]:
-        structure, case = check_run(one)
-        return list(drive_gains(DRIVES[structure.drive], case.drive))
-
-    return any(not np.array_equal(a, b) for a, b in zip(gains(study), gains(changed), strict=True))
 
 
 def around(
@@ -159,23 +146,37 @@ def _strength(structure: Structure, case: Case) -> Array:
     return jnp.sum(drives * sees, axis=1)
 
 
-def _entries(name: str, value: Any) -> list[str]:
+def _entries(study: Study, field: str) -> list[str]:
     """Names of the numbers in a field, which may be a list."""
-    if not isinstance(value, tuple):
-        return [name]
-    return [entry for k, x in enumerate(value) for entry in _entries(f"{name}[{k}]", x)]
+    numbers = numbers_in(known_field(field, study, "laws"))
+    return [field + "".join(f"[{k}]" for k in indices) for indices, _ in numbers]
 
 
-def _depends(study: Study, name: str) -> bool:
-    """Whether the study's controller depends on a setting."""
-    value = known_field(name, study, "laws")
-    changed = parse_study(set_value(study, name, NUDGE * value))
+def _decisive(
+    study: Study, names: Iterable[str], numbers: Callable[[Study], list[Any]]
+) -> list[str]:
+    """Settings that change some numbers of a study; none of a study that has no such numbers."""
     try:
-        pairs = zip(*map(_leaves, (study, changed)), strict=True)
-    except StudyError:  # this design is not one; its tuning says why
-        return False
-    return any(not np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+        before = numbers(study)
+    except StudyError:  # its tuning says why
+        return []
+
+    def decides(name: str) -> bool:
+        value = NUDGE * known_field(name, study, "laws")
+        try:
+            after = numbers(parse_study(set_value(study, name, value)))
+        except StudyError:
+            return False
+        pairs = zip(before, after, strict=True)
+        return any(not np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+
+    return [name for name in names if decides(name)]
 
 
-def _leaves(study: Study) -> list[Any]:
+def _of_controller(study: Study) -> list[Any]:
     return jax.tree.leaves(fixed_controller(study).controller)
+
+
+def _of_drive(study: Study) -> list[Any]:
+    structure, case = check_run(study)
+    return list(drive_gains(DRIVES[structure.drive], case.drive))

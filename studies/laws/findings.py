@@ -17,7 +17,7 @@ from studies.laws.candidates import AS_GIVEN
 from studies.laws.judging import FIGURES, Judged, changes
 from studies.laws.ranking import Ranking, rank
 from studies.laws.tuning import Budget, Tuned
-from studies.study.paths import set_value
+from studies.study.paths import set_values
 from studies.study.spec import Study, parse_study
 
 GIVEN, WITHOUT = "the design as given", "without control"
@@ -134,9 +134,7 @@ def combinations(study: Study, tuned: list[Tuned]) -> list[Combination]:
 
 def _combined(study: Study, law: Tuned, drive: Tuned) -> Combination:
     assert law.study is not None and drive.study is not None
-    both = law.study
-    for name, value in changes(study, drive.study).items():
-        both = parse_study(set_value(both, name, value))
+    both = parse_study(set_values(law.study, changes(study, drive.study)))
     return Combination(
         name=f"{law.candidate.name}; {drive.candidate.name}",
         law=law.candidate.name,

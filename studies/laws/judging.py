@@ -40,7 +40,6 @@ class Judged(NamedTuple):
     metrics: dict[str, np.ndarray]  # largest over the controlled links, (N, M, K)
     status: np.ndarray  # code of `jaxmodel.status`, (N, M, K)
     gain_margin: np.ndarray  # of the loop at rest on each machine [1], (N, M)
-    breaking_mode: np.ndarray  # what goes unstable beyond it, see `LoopFigures`, (N, M)
 
     @property
     def n_lost(self) -> np.ndarray:
@@ -127,7 +126,6 @@ def read_judged(folder: Path, n_designs: int, n_machines: int) -> Judged:
         metrics={name: ordered(_values(data, name)) for name in (*FIGURES, *SHOWN)},
         status=ordered(data["status"]),
         gain_margin=ordered(data["gain_margin"])[:, :, 0],
-        breaking_mode=ordered(data["breaking_mode"])[:, :, 0],
     )
 
 

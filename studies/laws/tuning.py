@@ -73,9 +73,7 @@ class Tuned(NamedTuple):
     candidate: Contender
     study: Study | None  # with its best numbers; None: no run of it finished
     reason: str  # why there is none, or which limit it does not keep; "" if all is well
-    objective: float  # over that of the design as given [1]
     n_free: int  # numbers it was tuned by
-    runs: int  # of the tuning
 
 
 def tuning_of(study: Study, candidate: Contender, budget: Budget) -> TuneSpec:
@@ -117,32 +115,13 @@ def tune_candidate(
         spec = tuning_of(study, candidate, budget)
         at = _optimised(spec, file, say)
     except StudyError as error:
-        return _untuned(candidate, str(error), 0)
+        return Tuned(candidate, None, str(error), len(candidate.free))
     best, family = at.winner(0), spec.moving[0]
-    count, runs = int(family.is_free.sum()), int(at.iteration) * budget.starts * budget.machines
-    objective = float(at.best_objective[best])
-    if not np.isfinite(objective):
-        return _untuned(candidate, "no start finished a run", runs)
+    count = int(family.is_free.sum())
+    if not np.isfinite(at.best_objective[best]):
+        return Tuned(candidate, None, "no start finished a run", count)
     tuned = tuned_study(spec, family, spec.free.values(at.best_place[best]))
-    return Tuned(
-        candidate=candidate,
-        study=tuned,
-        reason=_violated(spec, at, best),
-        objective=objective,
-        n_free=count,
-        runs=runs,
-    )
-
-
-def _untuned(candidate: Contender, reason: str, runs: int) -> Tuned:
-    return Tuned(
-        candidate=candidate,
-        study=None,
-        reason=reason,
-        objective=float("nan"),
-        n_free=len(candidate.free),
-        runs=runs,
-    )
+    return Tuned(candidate, tuned, _violated(spec, at, best), count)
 
 
 def _optimised(spec: TuneSpec, file: Path, say: Callable[[str], None]) -> Progress:

@@ -174,7 +174,7 @@ def plain_numbers(
     _check_field(entry.field, study, path)
     span = parse_bounds(bounds, path)
     numbers, positions = [], []
-    for indices, start in _entries(value):
+    for indices, start in numbers_in(value):
         whole = (*entry.indices, *indices)
         label = entry.field + "".join(f"[{k}]" for k in whole)
         for key, end in (("from", span.low), ("to", span.high)):
@@ -213,11 +213,11 @@ def parse_bounds(bounds: Any, path: str) -> Range:
     return parse_range(bounds, path)
 
 
-def _entries(value: Any, indices: tuple[int, ...] = ()) -> list[tuple[tuple[int, ...], float]]:
+def numbers_in(value: Any, indices: tuple[int, ...] = ()) -> list[tuple[tuple[int, ...], float]]:
     """Numbers of a nested list with their indices."""
     if not isinstance(value, tuple):
         return [(indices, value)]
-    return [entry for k, x in enumerate(value) for entry in _entries(x, (*indices, k))]
+    return [entry for k, x in enumerate(value) for entry in numbers_in(x, (*indices, k))]
 
 
 def _set(positions: tuple[Any, ...], numbers: Numbers, values: Array) -> Numbers:
