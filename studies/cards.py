@@ -160,6 +160,16 @@ def _certificate(certificate: Any) -> Card:
     return Card(certificate.study.title, [x for x in lines if x], heads, rows, figure=figure)
 
 
+def _laws(findings: Any) -> Card:
+    """Of `run_laws`."""
+    from studies.laws.findings import verdict
+    from studies.laws.plots import comparison
+    from studies.laws.report import HEADS, table_rows
+
+    rows = table_rows(findings)[:MOST]
+    return Card(findings.study.title, verdict(findings), HEADS, rows, figure=comparison(findings))
+
+
 def _export(export: Any) -> Card:
     """Of `export_design`."""
     from studies.show.sketch import sketch
@@ -204,6 +214,7 @@ CARDS: dict[str, Callable[[Any], Card]] = {
     "TuneFindings": _tuning,
     "Fitted": _fit,
     "Certificate": _certificate,
+    "LawFindings": _laws,
     "Exported": _export,
     "NamedModes": _modes,
 }

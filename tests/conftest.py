@@ -4,15 +4,14 @@ Tests compile much and run little, so the code generators of XLA and of the kern
 optimisations out here: the same programs, compiled in a third of the time.
 """
 
-import gc
 import os
 from pathlib import Path
 
-import jax
 import jaxlib
 import pytest
 
 from studies import config
+from studies.engine.programs import drop_programs
 
 FLAGS = "--xla_backend_optimization_level=0"
 # without the threshold for small loops, which takes a sixth of the time to compile
@@ -87,21 +86,10 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: place.get(Path(item.fspath).name, len(HEAVY)))
 
 
-#: Programs that XLA compiled hold some mappings each; Linux ends a process that wants more than
-#: 65,530 of them by a segmentation fault.
-MAPPINGS = 20_000
-
-
 def pytest_runtest_teardown(item, nextitem):
     """Drop compiled programs between files before they become too many."""
-    if nextitem is not None and nextitem.fspath != item.fspath and _mappings() > MAPPINGS:
-        jax.clear_caches()
-        gc.collect()
-
-
-def _mappings():
-    maps = Path("/proc/self/maps")
-    return maps.read_bytes().count(b"\n") if maps.exists() else 0
+    if nextitem is not None and nextitem.fspath != item.fspath:
+        drop_programs()
 
 
 @pytest.fixture(scope="session", autouse=True)

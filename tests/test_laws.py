@@ -11,10 +11,12 @@ from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
 from studies.engine.chunks import distinct_loops, judge_cases
 from studies.engine.margins import judge_loops
+from studies.engine.runs import run_study
 from studies.errors import StudyError
 from studies.laws import run as laws
 from studies.laws.candidates import AS_GIVEN, Contender, drive_candidates, law_candidates
-from studies.laws.judging import MOVES, changes, judging_sweep, machines_of
+from studies.laws.judging import MOVES, changes, judging_sweep
+from studies.laws.machines import machines_of, spread_of, with_noise
 from studies.laws.ranking import rank
 from studies.laws.tuning import Budget, Tuned, make_budget, tuning_of
 from studies.show.document import schema
@@ -91,6 +93,29 @@ def test_all_controllers_meet_the_same_machines_and_moves():
     assert 0.8 <= mass.min() < mass.max() <= 1.2
 
 
+def test_machines_differ_in_what_a_design_has():
+    assert set(spread_of(STUDY)) == {"link.stiffness_factor", "machine.platform_mass"}
+    loaded = STUDY.change(
+        load__mass=0.1,
+        link__basis="loaded",
+        link__joint_inertia_c=1e-5,
+        load__wrench=(1.0, 0.0, 0.0),
+    )
+    assert set(spread_of(loaded)) == {*spread_of(STUDY), "load.mass", "link.joint_inertia_c"}
+    machines = machines_of(loaded, 4, 0)
+    inertia = np.array([machine["link.joint_inertia_c"] for machine in machines])
+    assert inertia.shape == (4, 3) and np.all(np.abs(inertia / 1e-5 - 1) <= 0.2)
+    assert len({machine["run.seed"] for machine in machines}) == 4
+
+
+def test_noise_is_that_of_the_design_or_one_step_of_its_converter():
+    electronics = STUDY.electronics
+    step = electronics.adc_range / 2**electronics.adc_bits
+    assert with_noise(STUDY).electronics.adc_noise == step
+    noisy = STUDY.change(electronics__adc_noise=1e-3)
+    assert with_noise(noisy) == noisy
+
+
 def test_changes_rebuild_a_design():
     other = STUDY.change(
         control__law="lqg", control__laws={"lqg": {"voltage_weight": 1e-7}}, drive__kd=50.0
@@ -149,5 +174,13 @@ def test_a_comparison_writes_a_page_whose_order_is_that_of_the_runs(tmp_path, mo
     weak = next(x for x in document["controllers"] if x["name"] == "weak; PD")
     assert weak["ratio"]["residual_rms"][0] == pytest.approx(wanted)
     assert "strong; PD" in (tmp_path / "out" / "report.html").read_text()
+    strong = document["controllers"][0]
+    alone = run_study(findings.controllers[3].entry.study, False, has_margins=True).loop.robustness
+    # of three machines within a few percent of the nominal one
+    for name, value in alone.items():
+        assert strong["margins"][name] == pytest.approx(value, rel=0.2)
+    assert 0 < strong["rms_voltage"] < strong["peak_voltage"]
+    html = findings._repr_html_()
+    assert "strong; PD" in html and html.count("data:image/png;base64,") == 1
     with pytest.raises(StudyError, match="another design, budget or program"):
         laws.run_laws(STUDY, tmp_path / "out", 40.0, 0.4, is_resumed=True, is_quiet=True)

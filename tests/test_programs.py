@@ -52,6 +52,19 @@ def test_the_next_process_does_not_trace(keeping):
     assert scaled(structure, x + 1, 2.0)["sum"].tolist() == [26.0, 34.0] and len(TRACED) == 1
 
 
+def test_too_many_programs_are_dropped(keeping, monkeypatch):
+    """A process of many tunings would otherwise end for want of memory mappings."""
+    arguments = Structure(), np.ones(2), 1.0
+    first, in_use = scaled(*arguments), scaled.program(*arguments)
+    programs.drop_programs()
+    assert programs._PROGRAMS
+    monkeypatch.setattr(programs, "MOST_MAPPINGS", 0)
+    programs.drop_programs()
+    assert not programs._PROGRAMS
+    for again in (in_use(*arguments[1:]), scaled(*arguments)):
+        jax.tree.map(np.testing.assert_array_equal, first, again)
+
+
 @pytest.mark.parametrize(
     "other",
     [

@@ -21,6 +21,7 @@ from jaxmodel.simulate import Result
 from studies.config import processor
 from studies.engine.function import STEPPERS, BlockFunction, block_function, stepper
 from studies.engine.plan import Layout
+from studies.engine.programs import drop_programs
 from studies.errors import NoKernelError, warn_of_scan
 from studies.kernels import native
 from studies.kernels.gpu import is_known
@@ -76,6 +77,7 @@ class Executor:
             place: puts free parameters into a case.
             kind: how to step, a key of `STEPPERS`; default: the fastest.
         """
+        drop_programs()
         self.structure, self.layout, self.place = structure, layout, place
         self._has_own_ratio = has_own_ratio
         self._kind, self._reason = kind or stepper(structure), ""

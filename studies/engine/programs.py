@@ -12,11 +12,13 @@ what a session of Python has changed by hand in a module, or what files a user's
 
 from __future__ import annotations
 
+import gc
 import os
 import pickle
 from collections.abc import Callable
 from functools import cache, update_wrapper
 from hashlib import sha256
+from pathlib import Path
 from threading import RLock
 from typing import Any
 
@@ -32,6 +34,9 @@ from studies.kernels.compilation import ObjectCache
 from studies.space.free import Placing
 
 _LOCK = RLock()
+#: Compiled programs hold some memory mappings each, and LLVM ends a process that wants more than
+#: the 65,530 of Linux. Programs of a sweep or tuning take up to 10,000.
+MOST_MAPPINGS = 20_000
 #: Compiled programs of this process, by name.
 _PROGRAMS: dict[str, Any] = {}
 
@@ -130,6 +135,23 @@ def program(names: list[Any], arguments: list[Any], lower: Callable[[], Any]) ->
         if name not in _PROGRAMS:
             _PROGRAMS[name] = _load_or_compile(name, lower)
         return _PROGRAMS[name]
+
+
+def drop_programs() -> None:
+    """Forget compiled programs before they become too many; those in use stay."""
+    if _mappings() > MOST_MAPPINGS:
+        with _LOCK:
+            _PROGRAMS.clear()
+        jax.clear_caches()
+        gc.collect()
+
+
+def _mappings() -> int:
+    """Memory mappings of this process; 0 where the system does not list them."""
+    try:
+        return Path("/proc/self/maps").read_bytes().count(b"\n")
+    except OSError:
+        return 0
 
 
 def _load_or_compile(name: str, lower: Callable[[], Any]) -> Any:

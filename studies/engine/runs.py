@@ -16,7 +16,7 @@ from jaxmodel.loop_figures import MARGINS
 from jaxmodel.simulate import Result, simulate
 from studies.engine.poles import PoleReport, pole_report, tracked_modes
 from studies.engine.preflight import check_run
-from studies.engine.programs import kept_jit
+from studies.engine.programs import drop_programs, kept_jit
 from studies.engine.robustness import judge_robustness
 from studies.engine.stability import LoopFigures, run_report
 from studies.publish import shown
@@ -56,6 +56,7 @@ def run_study(
     Raises:
         StudyError: pose out of reach, singular path, motion longer than the run, stiff feedback.
     """
+    drop_programs()
     structure, case = check_run(study)
     if study.control.ratio_source == "own_run":
         case = with_ratio(case, _own_ratio(study, structure, case, has_record))

@@ -15,8 +15,9 @@ from studies.errors import StudyError
 from studies.export.cost import products_of
 from studies.laws.candidates import AS_GIVEN
 from studies.laws.judging import FIGURES, Judged, changes
-from studies.laws.ranking import Ranking, rank
+from studies.laws.ranking import RESAMPLES, Ranking, rank
 from studies.laws.tuning import Budget, Tuned
+from studies.publish import shown
 from studies.study.paths import set_values
 from studies.study.spec import Study, parse_study
 
@@ -52,6 +53,9 @@ class LawFindings(NamedTuple):
     failed: list[Tuned]  # those of which no design came
     judged: Judged
     rankings: dict[str, Ranking]  # by metric of FIGURES, of the controllers in the competition
+
+    def _repr_html_(self) -> str:
+        return shown(self)
 
     @property
     def competing(self) -> list[int]:
@@ -164,16 +168,16 @@ def verdict(findings: LawFindings) -> list[str]:
     ranking = findings.ranking
     if ranking.best < 0:
         return ["No controller keeps the budget and finishes all runs."]
-    best = findings.name(ranking.best)
-    share = 100 * ranking.share[ranking.best]
+    best, share = findings.name(ranking.best), ranking.share[ranking.best]
     tied = [
         findings.name(k)
         for k in ranking.order
         if k != ranking.best and np.isfinite(ranking.ratio[k]) and ranking.is_tied[k]
     ]
+    often = "all" if share == 1 else f"{100 * share:.0f} % of"
     lines = [
-        f"{best} leaves the least residual vibration; other machines of the same spread would "
-        f"put it first with {share:.0f} % certainty."
+        f"{best} leaves the least residual vibration; it is first in {often} {RESAMPLES} "
+        "resamplings of the machines."
     ]
     if tied:
         lines.append(f"Not to be told from it on these machines: {', '.join(tied)}.")

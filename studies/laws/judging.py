@@ -1,8 +1,7 @@
 """Tuned controllers on machines and moves that none of them was tuned on.
 
-One sweep, whose environments are the machines and moves: link by link the true stiffness within
-5 %, the platform's mass within 20 %, moves a quarter slower and a fifth faster than the design's,
-each run with its own noise. Every controller meets the same machines.
+One sweep, whose environments are the machines (see `machines`) and moves a quarter slower and a
+fifth faster than the design's. Every controller meets the same machines.
 """
 
 from __future__ import annotations
@@ -13,11 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxmodel import status
+from jaxmodel.loop_figures import MARGINS
 from studies.engine.results import SweepData, metric_values, read_sweep
-from studies.laws.tuning import SPREAD
 from studies.space.spec import SweepSpec, parse_sweep
-from studies.study.consistency import each_link
-from studies.study.paths import known_field
 from studies.study.spec import Study
 
 #: Move times over the design's.
@@ -39,38 +36,13 @@ class Judged(NamedTuple):
 
     metrics: dict[str, np.ndarray]  # largest over the controlled links, (N, M, K)
     status: np.ndarray  # code of `jaxmodel.status`, (N, M, K)
-    gain_margin: np.ndarray  # of the loop at rest on each machine [1], (N, M)
+    margins: dict[str, np.ndarray]  # of the loop at rest on each machine, by name, (N, M)
 
     @property
     def n_lost(self) -> np.ndarray:
         """Runs that did not finish, (N,)."""
         is_lost = ~np.isin(self.status, status.FINISHED)
         return np.asarray(is_lost.sum(axis=(1, 2)))
-
-
-def machines_of(study: Study, count: int, seed: int) -> list[dict[str, Any]]:
-    """Machines to judge on: fields of the study and their values, drawn by Latin hypercube.
-
-    Args:
-        study: the design.
-        count: how many machines.
-        seed: of the draw.
-    """
-    from scipy.stats import qmc
-
-    fields = {name: known_field(name, study, "laws") for name in SPREAD}
-    sizes = {name: 3 if name.startswith("link.") else 1 for name in fields}
-    points = qmc.LatinHypercube(sum(sizes.values()), rng=seed).random(count)
-    machines: list[dict[str, Any]] = [{} for _ in range(count)]
-    first = 0
-    for name, value in fields.items():
-        shift = 2 * points[:, first : first + sizes[name]] - 1
-        factor = 1 + SPREAD[name] / 100 * shift
-        first += sizes[name]
-        each = factor * (each_link(value) if sizes[name] == 3 else value)
-        for machine, row in zip(machines, each.tolist(), strict=True):
-            machine[name] = row if sizes[name] == 3 else row[0]
-    return machines
 
 
 def judging_sweep(study: Study, designs: list[Study], machines: list[dict[str, Any]]) -> SweepSpec:
@@ -94,6 +66,7 @@ def judging_sweep(study: Study, designs: list[Study], machines: list[dict[str, A
         ],
         "environments": names,
         "metrics": [*FIGURES, *SHOWN],
+        "robustness": list(MARGINS),
     }
     return parse_sweep(study.model_dump() | {"sweep": sweep})
 
@@ -125,7 +98,7 @@ def read_judged(folder: Path, n_designs: int, n_machines: int) -> Judged:
     return Judged(
         metrics={name: ordered(_values(data, name)) for name in (*FIGURES, *SHOWN)},
         status=ordered(data["status"]),
-        gain_margin=ordered(data["gain_margin"])[:, :, 0],
+        margins={name: ordered(data[name])[:, :, 0] for name in ("gain_margin", *MARGINS)},
     )
 
 

@@ -9,12 +9,13 @@ import numpy as np
 
 from studies.laws.findings import LawFindings, verdict
 from studies.laws.judging import FIGURES, MOVES
+from studies.laws.machines import spread_of
 from studies.laws.ranking import CONFIDENCE
-from studies.laws.tuning import SPREAD
 from studies.show.document import json_text
 from studies.show.pages import page
 from studies.show.sketch import CAPTION
 from studies.show.units import number
+from studies.study.consistency import patch_centers
 from studies.study.margin import margin_text
 
 #: Columns of the table: metric, its unit, how runs become one number.
@@ -32,12 +33,21 @@ HEADS = (
     "settling, median [ms]",
     "platform error while moving, median [µm]",
     "largest voltage [V]",
+    "rms voltage, mean [V]",
     "control energy, mean [V² s]",
+    "note",
+)
+#: Margins of the second table.
+SHOWN_MARGINS = ("disk_margin", "gain_margin", "phase_margin", "delay_margin")
+LOOP_HEADS = (
+    "controller",
+    "disk margin, worst [1]",
     "gain margin, worst [1]",
+    "phase margin, worst [deg]",
+    "delay margin, worst [samples]",
     "breaks first (nominal machine)",
     "products a sample",
     "numbers tuned",
-    "note",
 )
 
 
@@ -58,16 +68,23 @@ def report(findings: LawFindings, images: Path | None = None) -> str:
         budget=findings.budget,
         verdict=verdict(findings),
         heads=HEADS,
-        rows=[_row(findings, k) for k in _order(findings)],
+        rows=table_rows(findings),
+        loop_heads=LOOP_HEADS,
+        loop_rows=[_loop_row(findings, k) for k in _order(findings)],
         failed=findings.failed,
         machines=machines,
         moves=moves,
         times=MOVES,
-        spread=SPREAD,
+        spread=spread_of(findings.study),
         confidence=CONFIDENCE,
         figures=FIGURES,
         sketch_caption=CAPTION,
     )
+
+
+def table_rows(findings: LawFindings) -> list[list[str]]:
+    """Rows under HEADS: the competition, best first, then the others."""
+    return [_row(findings, k) for k in _order(findings)]
 
 
 def _order(findings: LawFindings) -> list[int]:
@@ -82,9 +99,6 @@ def _row(findings: LawFindings, k: int) -> list[str]:
     values = {name: _over(judged.metrics[name][k], over) for name, _, over in COLUMNS}
     lost = int(judged.n_lost[k])
     note = "; ".join(filter(None, (controller.reason, f"{lost} runs lost" if lost else "")))
-    loop = controller.loop
-    margins = judged.gain_margin[k]
-    has_margin = loop is not None and np.isfinite(margins).any()
     return [
         controller.entry.name,
         number(values["residual_rms"], "m"),
@@ -92,13 +106,38 @@ def _row(findings: LawFindings, k: int) -> list[str]:
         number(values["settling_time"], "s"),
         number(values["pose_error_peak"], "m"),
         number(values["peak_voltage"], "V"),
+        f"{_rms_voltage(findings, k):.3g}",
         f"{values['control_energy']:.3g}",
-        margin_text(float(np.nanmin(margins))) if has_margin else "-",
+        note or "-",
+    ]
+
+
+def _loop_row(findings: LawFindings, k: int) -> list[str]:
+    controller, loop = findings.controllers[k], findings.controllers[k].loop
+    margins = _worst_margins(findings, k) if loop is not None else {}
+    texts = [
+        margin_text(x, 3) if name == "gain_margin" else f"{x:.3g}" for name, x in margins.items()
+    ]
+    return [
+        controller.entry.name,
+        *(texts or ["-"] * len(SHOWN_MARGINS)),
         (loop.breaking or "-") if loop is not None else "-",
         "-" if controller.products is None else str(controller.products),
         str(controller.entry.n_free),
-        note or "-",
     ]
+
+
+def _worst_margins(findings: LawFindings, k: int) -> dict[str, float]:
+    """Least margins of a controller on the machines it was judged on."""
+    return {name: _over(findings.judged.margins[name][k], np.min) for name in SHOWN_MARGINS}
+
+
+def _rms_voltage(findings: LawFindings, k: int) -> float:
+    """Of an actuator of the controlled links in the mean run [V]."""
+    study = findings.controllers[k].entry.study
+    count = sum(findings.study.control.links) * patch_centers(study).shape[1]
+    energy = _over(findings.judged.metrics["control_energy"][k], np.mean)
+    return float(np.sqrt(energy / (count * study.run.duration)))
 
 
 def _over(values: np.ndarray, over: Any) -> float:
@@ -143,7 +182,8 @@ def _entry(findings: LawFindings, k: int) -> dict[str, Any]:
         "reason": controller.reason,
         "numbers_tuned": controller.entry.n_free,
         "products": controller.products,
-        "gain_margin": _over(judged.gain_margin[k], np.min),
+        "margins": _worst_margins(findings, k),
+        "rms_voltage": _rms_voltage(findings, k),
         "breaking": "" if controller.loop is None else controller.loop.breaking,
         "runs_lost": int(judged.n_lost[k]),
     }

@@ -30,7 +30,8 @@ from studies.laws.findings import (
     find,
     verdict,
 )
-from studies.laws.judging import judging_sweep, machines_of, read_judged
+from studies.laws.judging import judging_sweep, read_judged
+from studies.laws.machines import machines_of, with_noise
 from studies.laws.report import document, report
 from studies.laws.tuning import Budget, Tuned, make_budget, tune_candidate
 from studies.publish import REPORT, publish, replacing
@@ -79,7 +80,7 @@ def run_laws(
             study.control.feedback,
             "'sampled', with a controlled link: what is compared is a sampled controller",
         )
-    study = with_window(resolved_study(study))
+    study = with_noise(with_window(resolved_study(study)))
     budget = make_budget(study, voltage, margin)
     with locked_folder(out, "comparison"):
         refuse_existing(out, COMPARISONS, is_resumed)
@@ -116,7 +117,12 @@ def _keep_request(file: Path, study: Study, budget: Budget) -> None:
 
 
 #: Modules that determine the numbers, with everything they import.
-DECISIVE = ("studies.laws.tuning", "studies.laws.judging", "studies.laws.candidates")
+DECISIVE = (
+    "studies.laws.tuning",
+    "studies.laws.judging",
+    "studies.laws.candidates",
+    "studies.laws.machines",
+)
 
 
 def _empty_sweep(study: Study) -> SweepSpec:

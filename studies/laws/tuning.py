@@ -16,6 +16,7 @@ from jaxmodel import status
 from studies.engine.runs import run_study
 from studies.errors import StudyError, field_error
 from studies.laws.candidates import Contender
+from studies.laws.machines import spread_of
 from studies.study.labels import describe
 from studies.study.spec import Study
 from studies.tuning.check import tuned_study
@@ -24,8 +25,6 @@ from studies.tuning.optimise import Progress, is_compatible, optimise
 from studies.tuning.run import make_evaluator
 from studies.tuning.spec import TuneSpec, parse_tuning
 
-#: Spread of the machines, the same as those of `judging`: those there are others.
-SPREAD = {"link.stiffness_factor": 5.0, "machine.platform_mass": 20.0}
 #: The limit on the loop.
 MARGIN = "disk_margin"
 
@@ -90,7 +89,7 @@ def tuning_of(study: Study, candidate: Contender, budget: Budget) -> TuneSpec:
         "starts": budget.starts,
         "iterations": budget.iterations,
         "seed": budget.seed,
-        "scenarios": {"count": budget.machines, "seed": budget.seed, "spread": SPREAD},
+        "scenarios": {"count": budget.machines, "seed": budget.seed, "spread": spread_of(study)},
     }
     return parse_tuning(study.model_dump() | {"tune": tune})
 
