@@ -244,8 +244,8 @@ def test_static_choices_make_groups():
     groups = make_plan(small_spec({"axes": axes})).groups
     assert {group.structure.feedback for group in groups} == {"none", "sampled"}
     assert all(len(group.rows) == 4 and group.structure.n_modes == 3 for group in groups)
-    with pytest.raises(StudyError, match="needs a compilation; allowed: up to 32"):
-        many = {"run.duration": {"from": 0.021, "to": 0.025, "count": 40}}
+    with pytest.raises(StudyError, match="needs a compilation; allowed: up to 64"):
+        many = {"run.duration": {"from": 0.021, "to": 0.029, "count": 80}}
         make_plan(small_spec({"axes": many}))
 
 

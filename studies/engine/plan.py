@@ -40,7 +40,7 @@ STATIC = (
     "electronics.sample_rate_hz",
 )
 #: More programs than this are rejected.
-PROGRAM_LIMIT = 32
+PROGRAM_LIMIT = 64
 #: Cases side by side on one device: enough to fill vectors, few enough to fit into its cache.
 LANES = 64
 #: On a GPU: enough for all its threads.
