@@ -117,6 +117,7 @@ class Drive(NamedTuple):
 
     kp: Array  # [N/m]
     kd: Array  # [N s/m]
+    model_mass: Array  # platform and payload that computed torque assumes, over the true [1], ()
     force_limit: Array  # [N]
     coulomb_friction: Array  # [N]
     friction_speed: Array  # speed of the tanh [m/s]

@@ -425,6 +425,16 @@ def straight_motion(chain: Chain, pose_rate: Array, pose_acc: Array) -> tuple[Ar
     return frame.link_motion(acc_f, acc_g - phi2 * frame.c_g)
 
 
+def with_platform(plant: Plant, factor: Array) -> Plant:
+    """The machine with mass, inertia and moment of platform and payload times a factor [1]."""
+    moment = plant.platform_moment
+    return plant._replace(
+        platform_mass=factor * plant.platform_mass,
+        platform_inertia=factor * plant.platform_inertia,
+        platform_moment=None if moment is None else factor * moment,
+    )
+
+
 def inverse_dynamics(
     plant: Plant, pose: Array, pose_rate: Array, pose_acc: Array, wrench: Array | None = None
 ) -> Array:

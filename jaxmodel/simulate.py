@@ -14,7 +14,7 @@ from jaxmodel.case import Case, Load, Structure
 from jaxmodel.controller import Controller
 from jaxmodel.delay import command_change, true_delay
 from jaxmodel.drives import DRIVES
-from jaxmodel.dynamics import inverse_dynamics
+from jaxmodel.dynamics import inverse_dynamics, with_platform
 from jaxmodel.kinematics import inverse_kinematics, path_status, singularity_distance
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import Inputs, Loop, Record, State, initial_state, step
@@ -70,7 +70,8 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
     rest = prepared.loop.rest
     wrench = case.load.wrench if structure.has_wrench else None
     sliders: Callable[..., Any] = partial(inverse_kinematics, plant)
-    torque: Callable[..., Any] = partial(inverse_dynamics, plant, wrench=wrench)
+    known = with_platform(plant, case.drive.model_mass)
+    torque: Callable[..., Any] = partial(inverse_dynamics, known, wrench=wrench)
     if rest is not None:
         sliders, torque = _about(sliders, rest.pose), _about(torque, rest.pose)
     rho, rho_rate = sliders(reference.position, reference.velocity)

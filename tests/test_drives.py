@@ -12,8 +12,9 @@ from jaxmodel import status
 from jaxmodel.case import Drive
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import DriveLaw, SliderError, drive_gains
+from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import closed_loop
-from jaxmodel.simulate import simulate
+from jaxmodel.simulate import command, simulate
 from studies.errors import StudyError
 from studies.export.c_drive import compare_drive, drive_code
 from studies.export.compiler import find_compiler
@@ -179,6 +180,37 @@ def test_computed_torque_follows_with_rigid_links_to_the_order_of_the_integrator
             peak[name, steps] = np.max(found.metrics.pose_error_peak[:2])
     assert peak["computed_torque", 1] < 1e-9 < 1e-5 < peak["pd", 1]
     assert 10 < peak["computed_torque", 1] / peak["computed_torque", 2] < 24
+
+
+def test_computed_torque_has_the_mass_that_it_is_told():
+    """The true mass moves; forces are those of a machine with 80 % of platform and payload."""
+    heavy, light = (
+        study_of(
+            "computed_torque",
+            drive__model_mass=share,
+            machine__platform_mass=0.25 * of,
+            machine__platform_inertia=3e-4 * of,
+            load__mass=0.1 * of,
+            load__inertia=1e-4 * of,
+            load__offset=(0.01, -0.02),
+        )
+        for share, of in ((0.8, 1.0), (1.0, 0.8))
+    )
+    forces = []
+    for study in (heavy, light):
+        structure, case = build_structure(study), as_arrays(build_case(study))
+        forces.append(
+            np.asarray(command(structure, case, prepare(structure, case)).inputs.feedforward)
+        )
+    np.testing.assert_allclose(*forces, rtol=1e-9, atol=1e-9 * np.abs(forces).max())
+    known = study_of("computed_torque", run__model="ked", control__feedback="none")
+    errors = []
+    for share in (1.0, 0.8):
+        study = known.change(drive__model_mass=share)
+        structure = build_structure(study)._replace(metrics=("pose_error_peak",))
+        found = jax.jit(simulate, static_argnums=0)(structure, as_arrays(build_case(study)))
+        errors.append(np.max(found.metrics.pose_error_peak[:2]))
+    assert errors[1] > 1e3 * errors[0]
 
 
 @pytest.mark.parametrize("name", short_ones(SAMPLED, ["super_twisting"]))

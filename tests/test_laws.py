@@ -15,7 +15,7 @@ from studies.engine.runs import run_study
 from studies.errors import StudyError
 from studies.laws import run as laws
 from studies.laws.candidates import AS_GIVEN, Contender, drive_candidates, law_candidates
-from studies.laws.judging import MOVES, changes, judging_sweep
+from studies.laws.judging import MOVES, breaking_text, changes, judging_sweep
 from studies.laws.machines import machines_of, spread_of, with_noise
 from studies.laws.ranking import rank
 from studies.laws.tuning import Budget, Tuned, make_budget, tuning_of
@@ -106,6 +106,10 @@ def test_machines_differ_in_what_a_design_has():
     inertia = np.array([machine["link.joint_inertia_c"] for machine in machines])
     assert inertia.shape == (4, 3) and np.all(np.abs(inertia / 1e-5 - 1) <= 0.2)
     assert len({machine["run.seed"] for machine in machines}) == 4
+    own = loaded.machine.platform_mass + loaded.load.mass
+    for machine in machines:  # computed torque goes on to assume what the design says
+        true = machine["machine.platform_mass"] + machine["load.mass"]
+        assert machine["drive.model_mass"] * true == pytest.approx(own)
 
 
 def test_noise_is_that_of_the_design_or_one_step_of_its_converter():
@@ -144,6 +148,14 @@ def test_cases_that_differ_in_motion_alone_share_a_loop():
     np.testing.assert_allclose(found.least_damping, wanted.least_damping, rtol=1e-6)
 
 
+def test_what_breaks_in_words():
+    assert breaking_text(np.nan, np.nan) == ""
+    assert breaking_text(10.0, 1214.0) == "mode 10 of the links, 1.21e+03 Hz"
+    assert breaking_text(0.0, 25.0) == "the platform on its drive, 25 Hz"
+    assert breaking_text(np.nan, 0.0) == "grows without oscillating"
+    assert breaking_text(np.nan, 30.0) == "30 Hz"
+
+
 def test_budget_from_the_command_line():
     for bad in ({"voltage": -1.0}, {"voltage": 1e3}, {"margin": 2.5}, {"margin": float("nan")}):
         with pytest.raises(StudyError, match=f"--{next(iter(bad))}"):
@@ -164,23 +176,23 @@ def test_a_comparison_writes_a_page_whose_order_is_that_of_the_runs(tmp_path, mo
     monkeypatch.setattr(laws, "_tune", lambda *arguments: [*candidates, drive])
     monkeypatch.setattr(laws, "MACHINES", 3)
     findings = laws.run_laws(STUDY, tmp_path / "out", 50.0, 0.4, is_quiet=True)
-    assert findings.name(findings.ranking.best) == "strong; PD"
+    assert findings.name(findings.ranking.best) == "strong + PD"
     document = json.loads((tmp_path / "out" / "laws.json").read_text())
     jsonschema.validate(document, schema("laws"))
     names = [entry["name"] for entry in document["controllers"]]
-    assert names[:2] == ["strong; PD", "weak; PD"]
+    assert names[:2] == ["strong + PD", "weak + PD"]
     own = findings.judged.metrics["residual_rms"]
     wanted = np.exp(np.log(own[2] / own[3]).mean())  # weak over strong, by the definition
-    weak = next(x for x in document["controllers"] if x["name"] == "weak; PD")
+    weak = next(x for x in document["controllers"] if x["name"] == "weak + PD")
     assert weak["ratio"]["residual_rms"][0] == pytest.approx(wanted)
-    assert "strong; PD" in (tmp_path / "out" / "report.html").read_text()
+    assert "strong + PD" in (tmp_path / "out" / "report.html").read_text()
     strong = document["controllers"][0]
-    alone = run_study(findings.controllers[3].entry.study, False, has_margins=True).loop.robustness
+    alone = run_study(findings.controllers[3].study, False, has_margins=True).loop.robustness
     # of three machines within a few percent of the nominal one
     for name, value in alone.items():
         assert strong["margins"][name] == pytest.approx(value, rel=0.2)
     assert 0 < strong["rms_voltage"] < strong["peak_voltage"]
     html = findings._repr_html_()
-    assert "strong; PD" in html and html.count("data:image/png;base64,") == 1
+    assert "strong + PD" in html and html.count("data:image/png;base64,") == 1
     with pytest.raises(StudyError, match="another design, budget or program"):
         laws.run_laws(STUDY, tmp_path / "out", 40.0, 0.4, is_resumed=True, is_quiet=True)

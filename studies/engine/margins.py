@@ -157,12 +157,13 @@ def _unevenness(cases: Case) -> np.ndarray:
 
 
 def _judge_by_eigenvalues(structure: Structure, case: Case, figures: LoopFigures, k: int) -> None:
-    """Write the figures of one case, except what breaks; takes half a second."""
+    """Write the figures of one case, except the mode that breaks; takes half a second."""
     try:
         one = loop_report(structure, case, case.path.waypoints[0], structure.n_controlled)
     except np.linalg.LinAlgError:  # not finite
         return
     figures.gain_margin[k] = one.gain_margin
+    figures.breaking_frequency[k] = one.breaking_frequency
     n_links = np.sum(case.control.link_mask > 0)
     figures.least_damping[k] = least_controlled(
         one.damping_ratio.T, np.full(structure.n_controlled, n_links)

@@ -112,7 +112,8 @@ def drive_candidates(study: Study) -> list[Contender]:
 
 def _drive_candidate(study: Study, law: DriveLaw) -> Contender:
     settings = {"drive.kind": law.name}
-    plain = Contender(law.text, settings, {}, OF_DRIVES, is_drive=True)
+    name = law.text.removeprefix("computed torque with ").removeprefix("PD with ")
+    plain = Contender(name, settings, {}, OF_DRIVES, is_drive=True)
     own = plain.study(study)
     gains = {"drive.kp": own.drive.kp, "drive.kd": own.drive.kd}
     free = {name: around(gains[name], share=SERVO) for name in _decisive(own, gains, _of_drive)}

@@ -9,8 +9,8 @@ import numpy as np
 from jaxmodel import status
 from jaxmodel.laws import LAWS
 from studies.engine.controller import fixed_controller
+from studies.engine.frame import frame_of
 from studies.engine.preflight import check_run
-from studies.engine.stability import LoopFigures, loop_report
 from studies.errors import StudyError
 from studies.export.cost import products_of
 from studies.laws.candidates import AS_GIVEN
@@ -19,8 +19,11 @@ from studies.laws.ranking import RESAMPLES, Ranking, rank
 from studies.laws.tuning import Budget, Tuned
 from studies.publish import shown
 from studies.study.paths import set_values
+from studies.study.resolution import least_step, resolution_text
 from studies.study.spec import Study, parse_study
 
+#: Ratio of residual vibration up to which controllers are as good as each other.
+CLOSE = 1.1
 GIVEN, WITHOUT = "the design as given", "without control"
 
 
@@ -35,21 +38,13 @@ class Combination(NamedTuple):
     n_free: int  # numbers it was tuned by
 
 
-class ExaminedController(NamedTuple):
-    """One controller of the comparison."""
-
-    entry: Combination
-    reason: str  # why it is out of the competition, "" if it is not
-    loop: LoopFigures | None  # of its own machine; None without control
-    products: int | None  # multiplications a sample; None without control
-
-
 class LawFindings(NamedTuple):
     """Everything that a comparison found."""
 
     study: Study  # the design
     budget: Budget
-    controllers: list[ExaminedController]  # those that ran, in the order of `judged`
+    controllers: list[Combination]  # those that ran, in the order of `judged`
+    products: list[int | None]  # multiplications a sample of each; None without control
     failed: list[Tuned]  # those of which no design came
     judged: Judged
     rankings: dict[str, Ranking]  # by metric of FIGURES, of the controllers in the competition
@@ -69,7 +64,7 @@ class LawFindings(NamedTuple):
 
     def name(self, place: int) -> str:
         """Name of a controller of the competition."""
-        return self.controllers[self.competing[place]].entry.name
+        return self.controllers[self.competing[place]].name
 
 
 def find(
@@ -77,7 +72,7 @@ def find(
     budget: Budget,
     tuned: list[Tuned],
     judged: Judged,
-    figures: list[ExaminedController],
+    entries: list[Combination],
 ) -> LawFindings:
     """Rank what was judged.
 
@@ -86,12 +81,20 @@ def find(
         budget: of every candidate.
         tuned: all candidates.
         judged: of the controllers, in their order.
-        figures: the controllers.
+        entries: the controllers.
     """
+    products: dict[str, int | None] = {}
+    for entry in entries:
+        if entry.law not in products:
+            products[entry.law] = _products(entry.study)
     findings = LawFindings(
         study=study,
         budget=budget,
-        controllers=figures,
+        controllers=[
+            _with_stability(entry, margin)
+            for entry, margin in zip(entries, judged.margins["gain_margin"], strict=True)
+        ],
+        products=[products[entry.law] for entry in entries],
         failed=[x for x in tuned if x.study is None],
         judged=judged,
         rankings={},
@@ -140,7 +143,7 @@ def _combined(study: Study, law: Tuned, drive: Tuned) -> Combination:
     assert law.study is not None and drive.study is not None
     both = parse_study(set_values(law.study, changes(study, drive.study)))
     return Combination(
-        name=f"{law.candidate.name}; {drive.candidate.name}",
+        name=f"{law.candidate.name} + {drive.candidate.name}",
         law=law.candidate.name,
         drive=drive.candidate.name,
         study=both,
@@ -149,18 +152,18 @@ def _combined(study: Study, law: Tuned, drive: Tuned) -> Combination:
     )
 
 
-def examine(entry: Combination) -> ExaminedController:
-    """A controller's loop on its own machine, and what a sample of it costs."""
-    study = entry.study
-    if not study.is_controlled:
-        return ExaminedController(entry, entry.reason, None, None)
-    structure, case = check_run(study)
-    pose = np.array(study.motion.waypoints[0], float)
-    loop = loop_report(structure, case, pose, structure.n_controlled)
-    reason = entry.reason
-    if not loop.is_stable:
-        reason = "; ".join(filter(None, (reason, "unstable")))
-    return ExaminedController(entry, reason, loop, products_of(fixed_controller(study).channels))
+def _products(study: Study) -> int | None:
+    """Multiplications a sample of a controller, None without control."""
+    return products_of(fixed_controller(study).channels) if study.is_controlled else None
+
+
+def _with_stability(entry: Combination, margin: np.ndarray) -> Combination:
+    """A controller, out of the competition if any machine's gain margin (M,) is below 1."""
+    count = int(np.sum(margin < 1))
+    if not count:
+        return entry
+    text = f"unstable on {count} of {len(margin)} machines"
+    return entry._replace(reason="; ".join(filter(None, (entry.reason, text))))
 
 
 def verdict(findings: LawFindings) -> list[str]:
@@ -169,20 +172,48 @@ def verdict(findings: LawFindings) -> list[str]:
     if ranking.best < 0:
         return ["No controller keeps the budget and finishes all runs."]
     best, share = findings.name(ranking.best), ranking.share[ranking.best]
-    tied = [
-        findings.name(k)
-        for k in ranking.order
-        if k != ranking.best and np.isfinite(ranking.ratio[k]) and ranking.is_tied[k]
-    ]
     often = "all" if share == 1 else f"{100 * share:.0f} % of"
     lines = [
         f"{best} leaves the least residual vibration; it is first in {often} {RESAMPLES} "
         "resamplings of the machines."
     ]
-    if tied:
-        lines.append(f"Not to be told from it on these machines: {', '.join(tied)}.")
     others = [_other(findings, name) for name in list(FIGURES)[1:]]
-    return [*lines, _own_law(findings), *filter(None, others)]
+    every = [*_equals(findings), _own_law(findings), *others, _resolution(findings)]
+    return [*lines, *filter(None, every)]
+
+
+def _equals(findings: LawFindings) -> list[str]:
+    """Controllers that are as good as the best for practical purposes, and which to take then."""
+    ranking, rows = findings.ranking, findings.competing
+    with np.errstate(invalid="ignore"):
+        is_close = (ranking.ratio <= CLOSE) | ranking.is_tied
+    close = [int(k) for k in ranking.order if is_close[k] and np.isfinite(ranking.ratio[k])]
+    if len(close) < 2:
+        return []
+    judged, products = findings.judged, [findings.products[rows[k]] or 0 for k in close]
+    energy = [float(np.mean(judged.metrics["control_energy"][rows[k]])) for k in close]
+    margin = [float(np.min(judged.margins["disk_margin"][rows[k]])) for k in close]
+    frugal, small, robust = (
+        findings.name(close[int(np.argmin(x))]) for x in (energy, products, [-x for x in margin])
+    )
+    names = ", ".join(findings.name(k) for k in close[1:])
+    return [
+        f"Within {100 * (CLOSE - 1):.0f} % of it, or not to be told from it on these machines: "
+        f"{names}. Among all these, {frugal} needs the least control energy ({min(energy):.3g} "
+        f"V² s), {small} the fewest products a sample ({min(products)}), and {robust} has the "
+        f"largest disk margin ({max(margin):.3g})."
+    ]
+
+
+def _resolution(findings: LawFindings) -> str:
+    """Warning about residual vibration that the controller cannot measure."""
+    study, judged = findings.study, findings.judged
+    links = tuple(k for k, is_on in enumerate(study.control.links) if is_on)
+    step = least_step("residual_rms", frame_of(*check_run(study)).adc_step, links)
+    medians = np.array(
+        [np.nanmedian(judged.metrics["residual_rms"][k]) for k in findings.competing]
+    )
+    return resolution_text("Median residual_rms", medians, step, "controller")
 
 
 def _own_law(findings: LawFindings) -> str:
@@ -191,7 +222,7 @@ def _own_law(findings: LawFindings) -> str:
     own = LAWS[findings.study.control.law].text
     behind = []
     for name in (f"{own}, {AS_GIVEN}", own):
-        places = [k for k, row in enumerate(findings.competing) if entries[row].entry.law == name]
+        places = [k for k, row in enumerate(findings.competing) if entries[row].law == name]
         places = [k for k in places if np.isfinite(ranking.ratio[k])]
         if places:
             k = min(places, key=lambda k: ranking.ratio[k])

@@ -31,12 +31,17 @@ FIGURES = {
 SHOWN = ("peak_voltage", "settling_time", "pose_error_peak", "pose_error_rms", "saturated_fraction")
 
 
+#: What a sweep says of the instability at the gain margin.
+BREAKING = ("breaking_mode", "breaking_frequency")
+
+
 class Judged(NamedTuple):
     """N controllers on M machines in K moves; NaN where a run did not finish."""
 
     metrics: dict[str, np.ndarray]  # largest over the controlled links, (N, M, K)
     status: np.ndarray  # code of `jaxmodel.status`, (N, M, K)
     margins: dict[str, np.ndarray]  # of the loop at rest on each machine, by name, (N, M)
+    breaking: list[str]  # what goes unstable first, on the machine with the least gain margin
 
     @property
     def n_lost(self) -> np.ndarray:
@@ -95,11 +100,33 @@ def read_judged(folder: Path, n_designs: int, n_machines: int) -> Judged:
     def ordered(values: np.ndarray) -> np.ndarray:
         return np.asarray(values[origin].reshape(shape))
 
+    of_loop = {name: ordered(data[name])[:, :, 0] for name in (*BREAKING, "gain_margin", *MARGINS)}
+    mode, frequency = (of_loop.pop(name) for name in BREAKING)
+    worst = np.argmin(np.nan_to_num(of_loop["gain_margin"], nan=np.inf), axis=1)[:, None]
+    at_worst = (np.take_along_axis(x, worst, axis=1)[:, 0].tolist() for x in (mode, frequency))
     return Judged(
         metrics={name: ordered(_values(data, name)) for name in (*FIGURES, *SHOWN)},
         status=ordered(data["status"]),
-        margins={name: ordered(data[name])[:, :, 0] for name in ("gain_margin", *MARGINS)},
+        margins=of_loop,
+        breaking=[breaking_text(*each) for each in zip(*at_worst, strict=True)],
     )
+
+
+def breaking_text(mode: float, frequency: float) -> str:
+    """What goes unstable first, in words; "" if nothing does.
+
+    Args:
+        mode: order of the link mode, 0: of the platform on its drive, NaN: not named.
+        frequency: [Hz].
+    """
+    if np.isnan(frequency):
+        return ""
+    if frequency == 0:
+        return "grows without oscillating"
+    if np.isnan(mode):
+        return f"{frequency:.3g} Hz"
+    what = f"mode {mode:.0f} of the links" if mode else "the platform on its drive"
+    return f"{what}, {frequency:.3g} Hz"
 
 
 def _values(data: SweepData, name: str) -> np.ndarray:

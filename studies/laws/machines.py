@@ -58,4 +58,13 @@ def machines_of(study: Study, count: int, seed: int) -> list[dict[str, Any]]:
         each = factor * (each_link(value) if size == 3 else value)
         for machine, row in zip(machines, each.tolist(), strict=True):
             machine[name] = row if size == 3 else row[0]
+    for machine in machines:
+        machine["drive.model_mass"] = _known_mass(study, machine)
     return machines
+
+
+def _known_mass(study: Study, machine: dict[str, Any]) -> float:
+    """Mass of platform and payload that computed torque goes on to assume, over a machine's."""
+    own = study.machine.platform_mass + study.load.mass
+    true = machine["machine.platform_mass"] + machine.get("load.mass", 0.0)
+    return study.drive.model_mass * own / true

@@ -35,9 +35,9 @@ def comparison(findings: LawFindings) -> Figure:
         cloud = np.ravel(values[rows[k]])
         left.plot(cloud, np.full(cloud.size, y), "o", markersize=2.5, alpha=0.5, color="#0072B2")
         left.plot(np.median(cloud), y, "|", markersize=12, markeredgewidth=2, color="#000000")
-    left.set_xscale("log")
+    figures.log_scale(left, "x")
     left.set_yticks(range(len(order)), names)
-    left.set_xlabel(f"residual rms, every machine and move [{unit}]")
+    left.set_xlabel(f"residual rms [{unit}]")
     for place, (metric, color) in enumerate(zip(FIGURES, figures.SERIES, strict=False)):
         one = findings.rankings[metric]
         at = np.arange(len(order)) - 0.16 * (place - (len(FIGURES) - 1) / 2)
@@ -53,9 +53,9 @@ def comparison(findings: LawFindings) -> Figure:
             label=FIGURES[metric],
         )
     right.axvline(1.0, color="#666666", linewidth=0.8)
-    right.set_xscale("log")
+    figures.log_scale(right, "x")
     right.set_yticks(range(len(order)), [])
-    right.set_xlabel("over that of the best controller by this figure [1]")
+    right.set_xlabel("over the best by each figure [1]")
     figures.legend_above(figure, right)
     return figure
 
@@ -66,27 +66,26 @@ def grid(findings: LawFindings) -> Figure:
     Args:
         findings: of the comparison.
     """
-    entries = [controller.entry for controller in findings.controllers]
+    entries = findings.controllers
     laws = list(dict.fromkeys(entry.law for entry in entries if entry.law))
     drives = list(dict.fromkeys(entry.drive for entry in entries if entry.drive))
     figure, axes = figures.new_figure(1, 2, max(1.6, 0.3 * len(laws) + 0.8), False)
     factor, unit = readable("m")
-    titles = {"residual_rms": "residual rms", "pose_error_peak": "platform error while moving"}
+    titles = {"residual_rms": "residual rms", "pose_error_peak": "platform error"}
     for ax, (metric, title) in zip(axes[0], titles.items(), strict=True):
         values = np.full((len(laws), len(drives)), np.nan)
         for k, controller in enumerate(findings.controllers):
-            entry = controller.entry
-            if entry.law and not controller.reason:
-                place = laws.index(entry.law), drives.index(entry.drive)
+            if controller.law and not controller.reason:
+                place = laws.index(controller.law), drives.index(controller.drive)
                 values[place] = factor * np.median(findings.judged.metrics[metric][k])
         if np.isfinite(values).any():
-            ax.imshow(values, norm=LogNorm(), cmap="viridis_r", aspect="auto")
+            ax.imshow(values, norm=LogNorm(), cmap="Blues", alpha=0.5, aspect="auto")
         for i, row in enumerate(values):
             for j, value in enumerate(row):
-                text = f"{value:.3g}" if np.isfinite(value) else "-"
-                ax.text(j, i, text, ha="center", va="center", fontsize=figures.SMALL, color="w")
+                text = f"{value:.2g}" if np.isfinite(value) else "-"
+                ax.text(j, i, text, ha="center", va="center", fontsize=figures.SMALL)
         ax.set_xticks(range(len(drives)), drives, rotation=25, ha="right")
         ax.set_yticks(range(len(laws)), laws if metric == "residual_rms" else [])
-        ax.set_title(f"{title}, median [{unit}]")
+        ax.set_title(f"{title} [{unit}]")
         ax.grid(False)
     return figure

@@ -45,7 +45,7 @@ LOOP_HEADS = (
     "gain margin, worst [1]",
     "phase margin, worst [deg]",
     "delay margin, worst [samples]",
-    "breaks first (nominal machine)",
+    "breaks first, on the machine with the least gain margin",
     "products a sample",
     "numbers tuned",
 )
@@ -100,7 +100,7 @@ def _row(findings: LawFindings, k: int) -> list[str]:
     lost = int(judged.n_lost[k])
     note = "; ".join(filter(None, (controller.reason, f"{lost} runs lost" if lost else "")))
     return [
-        controller.entry.name,
+        controller.name,
         number(values["residual_rms"], "m"),
         _ratio(findings, k),
         number(values["settling_time"], "s"),
@@ -113,17 +113,17 @@ def _row(findings: LawFindings, k: int) -> list[str]:
 
 
 def _loop_row(findings: LawFindings, k: int) -> list[str]:
-    controller, loop = findings.controllers[k], findings.controllers[k].loop
-    margins = _worst_margins(findings, k) if loop is not None else {}
+    controller, products = findings.controllers[k], findings.products[k]
+    margins = {} if products is None else _worst_margins(findings, k)
     texts = [
         margin_text(x, 3) if name == "gain_margin" else f"{x:.3g}" for name, x in margins.items()
     ]
     return [
-        controller.entry.name,
+        controller.name,
         *(texts or ["-"] * len(SHOWN_MARGINS)),
-        (loop.breaking or "-") if loop is not None else "-",
-        "-" if controller.products is None else str(controller.products),
-        str(controller.entry.n_free),
+        findings.judged.breaking[k] or "-",
+        "-" if products is None else str(products),
+        str(controller.n_free),
     ]
 
 
@@ -134,7 +134,7 @@ def _worst_margins(findings: LawFindings, k: int) -> dict[str, float]:
 
 def _rms_voltage(findings: LawFindings, k: int) -> float:
     """Of an actuator of the controlled links in the mean run [V]."""
-    study = findings.controllers[k].entry.study
+    study = findings.controllers[k].study
     count = sum(findings.study.control.links) * patch_centers(study).shape[1]
     energy = _over(findings.judged.metrics["control_energy"][k], np.mean)
     return float(np.sqrt(energy / (count * study.run.duration)))
@@ -176,15 +176,15 @@ def _entry(findings: LawFindings, k: int) -> dict[str, Any]:
     controller, judged = findings.controllers[k], findings.judged
     rows = findings.competing
     entry: dict[str, Any] = {
-        "name": controller.entry.name,
-        "law": controller.entry.law,
-        "drive": controller.entry.drive,
+        "name": controller.name,
+        "law": controller.law,
+        "drive": controller.drive,
         "reason": controller.reason,
-        "numbers_tuned": controller.entry.n_free,
-        "products": controller.products,
+        "numbers_tuned": controller.n_free,
+        "products": findings.products[k],
         "margins": _worst_margins(findings, k),
         "rms_voltage": _rms_voltage(findings, k),
-        "breaking": "" if controller.loop is None else controller.loop.breaking,
+        "breaking": findings.judged.breaking[k],
         "runs_lost": int(judged.n_lost[k]),
     }
     entry |= {name: _over(judged.metrics[name][k], over) for name, _, over in COLUMNS}

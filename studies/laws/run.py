@@ -26,7 +26,6 @@ from studies.laws.findings import (
     LawFindings,
     as_given,
     combinations,
-    examine,
     find,
     verdict,
 )
@@ -141,10 +140,9 @@ def _compare(study: Study, out: Path, budget: Budget, phases: Phases) -> LawFind
     is_begun = (out / RUNS).exists()
     if run_sweep(spec, out / RUNS, is_begun, phases=phases).is_interrupted:
         raise KeyboardInterrupt
-    phases.begin("rank", "loops of the nominal machine")
+    phases.begin("rank")
     judged = read_judged(out / RUNS, len(entries), MACHINES)
-    controllers = [examine(entry) for entry in entries]
-    findings = find(study, budget, tuned, judged, controllers)
+    findings = find(study, budget, tuned, judged, entries)
     phases.begin("draw")
     _write(findings, out)
     for line in verdict(findings):
@@ -176,9 +174,9 @@ def _slug(name: str) -> str:
 def _write(findings: LawFindings, out: Path) -> None:
     with publish(out) as staging:
         for controller in findings.controllers[2:]:
-            file = staging / f"{_slug(controller.entry.name)}.toml"
-            title = f"{findings.study.title or 'study'}: {controller.entry.name}"[:200]
-            named = controller.entry.study.model_copy(update={"title": title})
+            file = staging / f"{_slug(controller.name)}.toml"
+            title = f"{findings.study.title or 'study'}: {controller.name}"[:200]
+            named = controller.study.model_copy(update={"title": title})
             file.write_text(study_template(named), encoding="utf-8")
         with styled():
             save(plots.comparison(findings), staging, "laws")

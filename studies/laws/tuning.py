@@ -16,7 +16,7 @@ from jaxmodel import status
 from studies.engine.runs import run_study
 from studies.errors import StudyError, field_error
 from studies.laws.candidates import Contender
-from studies.laws.machines import spread_of
+from studies.laws.machines import machines_of
 from studies.study.labels import describe
 from studies.study.spec import Study
 from studies.tuning.check import tuned_study
@@ -89,9 +89,17 @@ def tuning_of(study: Study, candidate: Contender, budget: Budget) -> TuneSpec:
         "starts": budget.starts,
         "iterations": budget.iterations,
         "seed": budget.seed,
-        "scenarios": {"count": budget.machines, "seed": budget.seed, "spread": spread_of(study)},
+        "scenarios": _scenarios(study, budget),
     }
     return parse_tuning(study.model_dump() | {"tune": tune})
+
+
+def _scenarios(study: Study, budget: Budget) -> dict[str, Any]:
+    """The machines of a tuning: the design's own and others like those to judge on."""
+    others = machines_of(study, budget.machines, budget.seed)  # the last one, to check, is not run
+    columns = {name: [machine[name] for machine in others] for name in others[0]}
+    del columns["run.seed"]
+    return {"count": budget.machines, "check": 1, "seed": budget.seed, "machines": columns}
 
 
 def tune_candidate(
