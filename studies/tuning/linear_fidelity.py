@@ -13,27 +13,19 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from jaxmodel.case import Case, Structure
-from jaxmodel.frequency_response import SampledLoopResponse, response_of_loop
-from jaxmodel.linear_residual import linear_residual
+from jaxmodel.case import Structure
 from jaxmodel.loop_figures import MARGINS, PEAKS
 from jaxmodel.parameters import Array
-from jaxmodel.prepare import prepare
-from jaxmodel.robustness import MarginPlace, margin_at, norm_peaks
-from jaxmodel.sampled_loop import LoopMatrices, closed_loop, slowest_decay, spillover
 from studies.engine.plan import padded_rows
-from studies.engine.programs import kept_jit
-from studies.engine.robustness import find_margins, response_and_modes
+from studies.engine.robustness import find_margins
 from studies.errors import StudyError
-from studies.study.cases import case_of, in_working_precision
+from studies.study.cases import in_working_precision
 from studies.study.numbers import Numbers, stack_numbers, study_numbers
 from studies.tuning.loop_figures import (
     allowed_on,
-    distance_of_path,
     figures_of_cases,
     judged_structure,
     machine_figures,
@@ -42,12 +34,16 @@ from studies.tuning.loop_figures import (
     with_decay,
     with_margin_modes,
 )
+from studies.tuning.loop_programs import (
+    STABLE,
+    figure_slopes,
+    loop_responses,
+    screen_designs,
+    tuned_cases,
+)
 from studies.tuning.scenarios import nominal, tuned_machines
 from studies.tuning.spec import BASELINE, OF_LOOP, Family, TuneSpec
 
-#: Unit of violations of `gain_margin`, and the decay rate that counts as stable if no limit of the
-#: loop is set [1/s].
-STABLE = 10.0
 #: Designs per call of a screen; each core takes one call after another.
 BATCH = 16
 
@@ -87,7 +83,7 @@ class LinearFidelity:
         baseline = self._baseline(families)
         #: Of the baseline, (S, t).
         self.baseline_terms = term_values(self.terms, baseline, self.machines.of_scenario)
-        shape = len(families), self.machines.count, len(self.names)
+        shape = len(families), self.machines.size, len(self.names)
         limits = [
             [allowed_on(x.limits[name], baseline[name]) for name in self.names] for x in families
         ]
@@ -111,7 +107,7 @@ class LinearFidelity:
         study = with_margin_modes(family.study(self._spec.study))
         numbers = study_numbers(study, structure, self.machines.columns)
         whole: Numbers = jax.tree.map(
-            lambda x: np.broadcast_to(x, (self.machines.count, *x.shape[1:])), numbers
+            lambda x: np.broadcast_to(x, (self.machines.size, *x.shape[1:])), numbers
         )
         return whole
 
@@ -124,7 +120,7 @@ class LinearFidelity:
         } | {name: f"tune.objective.{name}" for name in self.terms}
         is_stable_needed = any(name in OF_LOOP for name in relative)
         names = with_decay(tuple(relative)) if is_stable_needed else tuple(relative)
-        found = dict.fromkeys(self.names, np.full(self.machines.count, np.nan))
+        found = dict.fromkeys(self.names, np.full(self.machines.size, np.nan))
         if names:
             found |= machine_figures(self._spec, self._spec.study, self.machines.columns, names)
         for name, path in relative.items():
@@ -147,7 +143,7 @@ class LinearFidelity:
         """
         designs, p = values.shape
         count = len(self.names) + len(self.terms)
-        figures = np.zeros((designs, self.machines.count, count))
+        figures = np.zeros((designs, self.machines.size, count))
         slopes = np.zeros((*figures.shape, p))
         for batch in self._batches.values() if count else ():
             found = self._differentiate(batch, values[batch.rows])
@@ -164,7 +160,7 @@ class LinearFidelity:
 
     def _differentiate(self, batch: _Batch, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Figures of some designs on every machine, (designs, machines, m + t), and slopes."""
-        designs, machines = len(values), self.machines.count
+        designs, machines = len(values), self.machines.size
         place = self._spec.free.place
         margins = tuple(x for x in MARGINS if x in (*self.names, *self.terms))
         limits = self._limits[batch.rows].reshape(designs * machines, -1)
@@ -174,9 +170,9 @@ class LinearFidelity:
             own = jax.tree.map(lambda x: x[lanes], numbers)
             mine, places = values[lanes // machines], {}
             if margins:
-                response, modes = _responses(batch.structure, place, own, mine)
+                response, modes = loop_responses(batch.structure, place, own, mine)
                 places = find_margins(response, modes, margins, is_fine=True)
-            return _figure_slopes(
+            return figure_slopes(
                 batch.structure, self.names, self.terms, place, own, limits[lanes], mine, places
             )
 
@@ -204,7 +200,7 @@ class LinearFidelity:
         quick = [k for k, name in enumerate(self.names) if name not in (*MARGINS, *PEAKS)]
         names = tuple(self.names[k] for k in quick) or ("slowest_decay",)
         evaluate = partial(
-            _screen_batch,
+            screen_designs,
             batch.structure,
             names,
             self._spec.free.place,
@@ -250,10 +246,12 @@ class LinearFidelity:
         self, position: int, values: np.ndarray, names: tuple[str, ...]
     ) -> dict[str, np.ndarray]:
         """Figures of designs of one family on every machine, (n, machines)."""
-        batch, shape = self._batch_of(position), (len(values), self.machines.count)
+        batch, shape = self._batch_of(position), (len(values), self.machines.size)
         lanes = np.arange(shape[0] * shape[1])
         numbers = jax.tree.map(lambda x: x[lanes % shape[1]], batch.of_design(position))
-        cases = _cases(batch.structure, self._spec.free.place, numbers, values[lanes // shape[1]])
+        cases = tuned_cases(
+            batch.structure, self._spec.free.place, numbers, values[lanes // shape[1]]
+        )
         cases = jax.tree.map(np.asarray, cases)
         figures = figures_of_cases(batch.structure, cases, names, len(lanes))
         return {name: x.reshape(shape) for name, x in figures.items()}
@@ -318,138 +316,3 @@ class _Batch(NamedTuple):
             lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), self.numbers
         )
         return numbers
-
-
-class _Loop(NamedTuple):
-    """A loop in the program that judges it."""
-
-    structure: Structure
-    case: Case
-    matrices: LoopMatrices
-    figures: dict[str, Array]  # of its frequency response
-    decay: Array  # [1/s], ()
-
-
-def _excess(loop: _Loop, names: tuple[Any, ...], limits: Array) -> Array:
-    """x/(1 + |x|) for each limit, (m,): decay rates reach hundreds of their limit on both sides.
-
-    x is value/limit - 1, or -decay/STABLE of the loop with all gains times the required margin.
-    Figures of `jaxmodel.robustness` are those of stable loops: others count as 1 - decay/STABLE,
-    which is what margins reach at the edge.
-    """
-    excesses = []
-    for k, name in enumerate(names):
-        if name in loop.figures:
-            share = loop.figures[name] / limits[k]
-            within = 1 - share if name in MARGINS else share - 1
-            x = jnp.where(loop.decay > 0, within, 1 - loop.decay / STABLE)
-        elif name == "spillover":
-            x = spillover(loop.structure, loop.case, loop.matrices) / limits[k] - 1
-        elif name == "singularity_distance":
-            x = 1 - distance_of_path(loop.structure, loop.case) / limits[k]
-        elif name == "slowest_decay":
-            x = 1 - loop.decay / limits[k]
-        else:
-            feedback = limits[k] * loop.matrices.feedback
-            x = -_decay(loop.case, loop.matrices._replace(feedback=feedback)) / STABLE
-        excesses.append(x / (1 + jnp.abs(x)))
-    return jnp.stack(excesses) if names else jnp.zeros(0)
-
-
-def _terms(loop: _Loop, names: tuple[Any, ...]) -> Array:
-    """Terms of the objective, nan where the loop is unstable, (t,)."""
-    values = []
-    for name in names:
-        if name == "slowest_decay":
-            values.append(loop.decay)
-        elif name == "spillover":
-            values.append(spillover(loop.structure, loop.case, loop.matrices))
-        else:
-            values.append(loop.figures[name])
-    return jnp.where(loop.decay > 0, jnp.stack(values), jnp.nan) if names else jnp.zeros(0)
-
-
-def _decay(case: Case, matrices: LoopMatrices) -> Array:
-    return slowest_decay(matrices.open + matrices.feedback, case.electronics.period)
-
-
-def _loop(
-    structure: Structure, case: Case, names: tuple[Any, ...], places: dict[str, MarginPlace]
-) -> _Loop:
-    """A loop with its named figures of the frequency response, margins at their places."""
-    pose = case.path.waypoints[0]
-    matrices, figures = closed_loop(structure, case, pose), {}
-    if places or any(name in PEAKS for name in names):
-        response = response_of_loop(structure, case, prepare(structure, case).loop, pose)
-        figures = {name: margin_at(response, name, place) for name, place in places.items()}
-        peaks = tuple(name for name in PEAKS if name in names)
-        figures |= norm_peaks(response, peaks) if peaks else {}
-    return _Loop(structure, case, matrices, figures, _decay(case, matrices))
-
-
-# compiled without optimisation: it takes a fraction of the time
-@kept_jit(static_argnums=(0, 1), compiler_options={"xla_backend_optimization_level": 0})
-def _responses(
-    structure: Structure, place: Any, numbers: Numbers, values: Array
-) -> tuple[SampledLoopResponse, tuple[Array, Array]]:
-    """What a search of margins reads of each design."""
-
-    def one(x: Array, numbers: Numbers) -> tuple[SampledLoopResponse, tuple[Array, Array]]:
-        case = case_of(structure, place(numbers, x))
-        return response_and_modes(structure, case, case.path.waypoints[0])
-
-    return jax.vmap(one)(values, numbers)
-
-
-@kept_jit(static_argnums=(0, 1))
-def _cases(structure: Structure, place: Any, numbers: Numbers, values: Array) -> Case:
-    cases: Case = jax.vmap(lambda numbers, x: case_of(structure, place(numbers, x)))(
-        numbers, values
-    )
-    return cases
-
-
-@kept_jit(static_argnums=(0, 1, 2, 3))
-def _figure_slopes(
-    structure: Structure,
-    names: tuple[Any, ...],
-    terms: tuple[Any, ...],
-    place: Any,
-    numbers: Numbers,
-    limits: Array,
-    values: Array,
-    places: dict[str, MarginPlace],
-) -> tuple[Array, Array]:
-    """Excesses over limits and terms of loops, (n, m + t), and their derivatives by `values`."""
-
-    def figures(
-        x: Array, numbers: Numbers, limit: Array, places: dict[str, MarginPlace]
-    ) -> tuple[Array, Array]:
-        case = case_of(structure, place(numbers, x))
-        loop = _loop(structure, case, (*names, *terms), places)
-        whole = jnp.concatenate([_excess(loop, names, limit), _terms(loop, terms)])
-        return whole, whole
-
-    def one(design: tuple[Any, ...]) -> tuple[Array, Array]:
-        slope, whole = jax.jacrev(figures, has_aux=True)(*design)  # the figures come with it
-        return whole, slope
-
-    return jax.lax.map(one, (values, numbers, limits, places))
-
-
-@kept_jit(static_argnums=(0, 1, 2, 5))
-def _screen_batch(
-    structure: Structure,
-    names: tuple[Any, ...],
-    place: Any,
-    numbers: Numbers,
-    limits: Array,
-    links: tuple[int, ...],
-    values: Array,
-) -> tuple[Array, Array]:
-    def one(x: Array) -> tuple[Array, Array]:
-        loop = _loop(structure, case_of(structure, place(numbers, x)), names, {})
-        rms = linear_residual(structure, loop.case, loop.matrices)
-        return _excess(loop, names, limits), jnp.sqrt(jnp.mean(rms[np.array(links)] ** 2))
-
-    return jax.lax.map(one, values)

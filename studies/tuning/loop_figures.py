@@ -22,6 +22,7 @@ from jaxmodel.loop_figures import MARGINS, PEAKS
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopMatrices, closed_loop, spillover
+from studies.engine.columns import ON_DEMAND
 from studies.engine.programs import kept_jit
 from studies.engine.robustness import judge_robustness
 from studies.engine.stability import gain_margin
@@ -34,6 +35,14 @@ from studies.tuning.spec import BASELINE, LOWER, TuneSpec
 
 #: Points of each straight move at which its distance from singularities is evaluated.
 PATH_POINTS = 17
+#: Units of all figures.
+LOOP_UNITS = {
+    "gain_margin": "1",
+    "slowest_decay": "s-1",
+    "spillover": "1",
+    "singularity_distance": "rad",
+    **{name: unit for name, (unit, _) in ON_DEMAND.items()},
+}
 #: Figures that every design has.
 ALWAYS = ("gain_margin", "slowest_decay", "spillover", "singularity_distance")
 
@@ -112,7 +121,8 @@ def figures_of_cases(
     Args:
         structure: from `judged_structure`.
         cases: leaves with a leading axis, all cases or 1.
-        names: of `LOOP_LIMITS`; margins of unstable loops are 0, their peaks infinite.
+        names: of `LOOP_LIMITS`; margins of unstable loops are 0, their peaks infinite. Figures of
+            loops whose controller does not exist are nan.
         count: number of cases.
     """
     of_response = tuple(name for name in names if name in (*MARGINS, *PEAKS))
@@ -127,8 +137,9 @@ def figures_of_cases(
         each = list(pool.map(judge, range(count if plain else 0)))
     figures = {name: np.array([one[name] for one in each]) for name in plain}
     if of_response:
-        is_stable = figures["slowest_decay"] > 0
-        figures |= judge_robustness(structure, cases, of_response, np.where(is_stable, 1.0, 0.0))
+        decay = figures["slowest_decay"]
+        is_stable = np.where(np.isnan(decay), np.nan, decay > 0)
+        figures |= judge_robustness(structure, cases, of_response, is_stable)
     return {name: figures[name] for name in names}
 
 
@@ -140,6 +151,8 @@ def _figures_of_case(structure: Structure, case: Case, names: set[str]) -> dict[
         return figures
     matrices = _closed_loop(structure, case)
     open_loop, feedback = np.asarray(matrices.open), np.asarray(matrices.feedback)
+    if not (np.isfinite(open_loop).all() and np.isfinite(feedback).all()):
+        return dict.fromkeys(names, np.nan)
 
     def poles(factor: float) -> np.ndarray:
         return np.linalg.eigvals(open_loop + factor * feedback)
@@ -205,6 +218,16 @@ def relative_margin(name: str, values: Array, allowed: Array) -> float:
     """
     share = np.asarray(values) / allowed - 1
     return float(np.min(share if name in LOWER else -share))
+
+
+def worst_value(name: str, values: np.ndarray) -> float:
+    """A figure (machines,) on the worst machine."""
+    return float(np.min(values) if name in LOWER else np.max(values))
+
+
+def unit_text(name: str) -> str:
+    """Unit of a figure as a report shows it."""
+    return LOOP_UNITS[name].replace("s-1", "1/s")
 
 
 def allowed_on(limit: float | str, baseline: Array) -> Array:

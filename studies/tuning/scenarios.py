@@ -60,8 +60,8 @@ class LoopMachines(NamedTuple):
     of_scenario: np.ndarray  # machine of each scenario, (S,)
 
     @property
-    def count(self) -> int:
-        """Number of machines."""
+    def size(self) -> int:
+        """How many there are."""
         return len(self.columns["run.seed"])
 
 
