@@ -26,7 +26,7 @@ from studies.tuning.audit import Disagreement
 from studies.tuning.check import JudgedDesign, OwnRun
 from studies.tuning.evaluate import Evaluation, Evaluator
 from studies.tuning.folder import open_tuning
-from studies.tuning.linear_fidelity import DesignFigures
+from studies.tuning.loop_figures import DesignFigures
 from studies.tuning.objective import objective_of
 from studies.tuning.optimise import begin, is_compatible
 from studies.tuning.report import TuneFindings, n_outside, report
