@@ -462,7 +462,7 @@ def test_a_tuning_s_limits_and_numbers():
         "(inactive, 75.00 % left)",
         "- all: peak_voltage at most 30 (active, 1.00 % left); gain_margin at least 1.5 "
         "(inactive, 58.33 % left)",
-        "Of the loop: on the worst of 1 machine.",
+        "Those of the loop: on the nominal machine, the only one of the tuning.",
         "worst disagreement is 1.5e-06 (of peak_voltage by control.gain_factor, at the best "
         "design), below 0.0001.",
         "Ended after all 20 iterations",

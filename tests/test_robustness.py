@@ -459,7 +459,7 @@ def linear_tuning(limits, objective):
         {**GAIN, "drive.kp": EVERY_KIND["drive.kp"]},
         limits=limits,
         objective=objective,
-        scenarios={"count": 2, "spread": {"control.velocity_gain": 20.0}, **EACH},
+        scenarios={"count": 2, "spread": {"control.velocity_gain[0]": 20.0}, **EACH},
     )
     linear = LinearFidelity(spec, [spec.families[0]] * 4)
     steps = np.array([[0.0, 0.0], [1e-5, 0.0], [-1e-5, 0.0]])
@@ -490,7 +490,7 @@ def test_the_worst_machine_counts_in_tunings(monkeypatch):
     worst = int(other < nominal)
     chained = -found.term_slopes[0, worst, 0] / 0.8 / (1 + abs(x)) ** 2
     np.testing.assert_allclose(found.limit_slopes[0, 0], chained, rtol=1e-9)
-    assert worst == 1 and other < 0.99 * nominal
+    assert worst == 1 and other < 0.999 * nominal
     assert np.abs(found.term_slopes[0, 0] / found.term_slopes[0, 1] - 1).min() > 1e-3
     beyond = linear.beyond(0, designs)
     assert (beyond[:3] < 0).all() and beyond[3] == 1.0

@@ -173,6 +173,18 @@ def test_a_baseline_needs_a_stable_loop_to_be_measured_against(tune, message):
         LinearFidelity(spec, list(spec.families))
 
 
+@pytest.mark.long
+def test_an_objective_can_be_of_the_loop_alone():
+    spec = tuning(GAIN, objective={"slowest_decay": 1.0}, starts=3)
+    evaluator = make_evaluator(spec)
+    values = spec.free.values(spec.free.places())
+    found = evaluator.evaluate(values * np.array([[1.0], [1.001], [0.999]]))
+    slope = (found.objective[1] - found.objective[2]) / (0.002 * values[0])
+    np.testing.assert_allclose(found.objective[0], 1.0, rtol=1e-6)
+    np.testing.assert_allclose(found.slope[0, 0], slope, rtol=1e-4)
+    assert (found.status == 0).all() and slope != 0
+
+
 # --- downhill -------------------------------------------------------------------------------------
 
 
