@@ -462,7 +462,8 @@ def linear_tuning(limits, objective):
         scenarios={"count": 2, "spread": {"control.velocity_gain[0]": 20.0}, **EACH},
     )
     linear = LinearFidelity(spec, [spec.families[0]] * 4)
-    steps = np.array([[0.0, 0.0], [1e-5, 0.0], [-1e-5, 0.0]])
+    step = np.array([2e-3, 0.0])  # peaks are found to 1e-6
+    steps = np.stack([0 * step, step, -step])
     designs = np.concatenate([[0.4, 2e4] * (1 + steps), [[200.0, 2e4]]])
     found = linear.evaluate(designs)
 

@@ -15,7 +15,7 @@ from studies.study.paths import Parts, set_value
 from studies.study.spec import parse_study
 from studies.tuning.evaluate import Evaluator
 from studies.tuning.objective import (
-    Measured,
+    ScenarioFigures,
     judge_with_cotangents,
     objective_of,
     tail_weights,
@@ -199,6 +199,14 @@ def deep(n):
             "tune.objective: 'singularity_distance' can only be a limit$",
         ),
         ({"free": GAIN, "objective": {"disc_margin": 1.0}}, "did you mean 'disk_margin'"),
+        (
+            {
+                "free": GAIN,
+                "objective": {"disk_margin": 1.0},
+                "families": {"one": {"set": {"control.law": "modified_imsc"}}},
+            },
+            "tune.objective.disk_margin: control.law 'modified_imsc' switches between loops",
+        ),
         ({"free": GAIN, "objective": {"disk_margin[1]": 1.0}}, "no such entry; allowed: disk_marg"),
         ({"free": GAIN, "objective": {"disk_margin": 0.0}}, "disk_margin = 0.0; allowed: a number"),
         ({"free": GAIN, "limits": {"peak_volt": 1.0}}, "did you mean 'peak_voltage'"),
@@ -417,6 +425,14 @@ def test_three_values_are_spread_together_on_every_move():
     assert 0 < np.abs(share - 1).max() <= 0.05
 
 
+def test_figures_of_the_loop_need_one():
+    control = {**SMALL["control"], "feedback": "ideal"}
+    for tune in ({"objective": {"disk_margin": 1.0}}, {"limits": {"disk_margin": 1.0}}):
+        message = f"'sampled' where tune.{next(iter(tune))} holds disk_margin"
+        with pytest.raises(StudyError, match=message):
+            parse_tuning({**SMALL, "control": control, "tune": {"free": GAIN, **tune}})
+
+
 def test_the_loop_of_a_machine_counts_once():
     """Neither moves nor noise change it, nor a machine that equals the nominal one."""
     each = {"motion.move_time": [0.03, 0.035]}
@@ -461,7 +477,7 @@ def test_the_tail_is_that_of_metrics_and_loops_together(tail):
 
     def measured(rms, margin, peak):
         metrics = Metrics({"residual_rms": rms[:, None, None] * np.ones((3, 3))})
-        return Measured(metrics, np.stack([margin, peak], axis=1))
+        return ScenarioFigures(metrics, np.stack([margin, peak], axis=1))
 
     one = np.ones(3)
     shares = 0.5 * rms / 4 + 0.25 * 1.0 / margin + 0.25 * peak / 2

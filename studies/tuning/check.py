@@ -35,7 +35,7 @@ from studies.tuning.loop_figures import (
     with_decay,
 )
 from studies.tuning.objective import (
-    Measured,
+    ScenarioFigures,
     allowed_limits,
     baseline_limits,
     judge_designs,
@@ -203,7 +203,7 @@ def judge(spec: TuneSpec, designs: list[Study], runs: PartRuns) -> list[JudgedDe
     fresh = loop_machines(spec, columns)
     loops = [_loops(spec, study, fresh) for study in designs]
     terms = np.stack([_terms(spec, loop, fresh) for loop in loops])
-    measured = Measured(by_design.metrics, terms)
+    measured = ScenarioFigures(by_design.metrics, terms)
     baseline = jax.tree.map(lambda x: x[0], measured)
     end = runs.of(spec.parts()).structure.n_steps / spec.study.electronics.sample_rate_hz
     judged = []
@@ -232,7 +232,7 @@ def judge(spec: TuneSpec, designs: list[Study], runs: PartRuns) -> list[JudgedDe
     return [_with_poles(study, design) for study, design in zip(designs, judged, strict=True)]
 
 
-class _Loops(NamedTuple):
+class _DesignLoops(NamedTuple):
     """Figures of a design's loops."""
 
     file: DesignFigures | None  # as in its file; None with other feedback than sampled
@@ -240,17 +240,17 @@ class _Loops(NamedTuple):
     fresh: dict[str, np.ndarray]  # on fresh ones, (machines,)
 
 
-def _loops(spec: TuneSpec, study: Study, fresh: LoopMachines) -> _Loops:
+def _loops(spec: TuneSpec, study: Study, fresh: LoopMachines) -> _DesignLoops:
     names = spec.loop_names
     of_fresh = tuple(dict.fromkeys((*names, *with_decay(spec.loop_terms))))
-    return _Loops(
+    return _DesignLoops(
         file=loop_figures(spec, study) if study.control.feedback == "sampled" else None,
         tuned=machine_figures(spec, study, tuned_machines(spec).columns, names) if names else {},
         fresh=machine_figures(spec, study, fresh.columns, of_fresh) if names else {},
     )
 
 
-def _terms(spec: TuneSpec, loop: _Loops, fresh: LoopMachines) -> np.ndarray:
+def _terms(spec: TuneSpec, loop: _DesignLoops, fresh: LoopMachines) -> np.ndarray:
     """Terms of the objective in fresh scenarios, then as in the design's file, (S + 1, t)."""
     names, count = spec.loop_terms, len(fresh.of_scenario)
     if loop.file is None or not names:
@@ -353,7 +353,7 @@ def search(spec: TuneSpec, linear: LinearFidelity, position: int) -> RandomSearc
         baseline, others = (jax.tree.map(lambda x, k=k: x[k], metrics) for k in (0, slice(1, None)))
         baseline = baseline if measure is None else measure
         allowed = allowed_limits(goal, family, baseline_limits(goal, baseline))
-        measured = Measured(others, terms), Measured(baseline, linear.baseline_terms)
+        measured = ScenarioFigures(others, terms), ScenarioFigures(baseline, linear.baseline_terms)
         judgement = judge_designs(goal, *measured, allowed)
         batches.append((*map(np.asarray, judgement), first_residual(goal, metrics)[1:]))
     objective, limits, peaks, residual = (np.concatenate(x)[:n] for x in zip(*batches, strict=True))

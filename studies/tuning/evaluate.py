@@ -25,8 +25,8 @@ from studies.study.numbers import study_numbers
 from studies.study.paths import Parts
 from studies.tuning.linear_fidelity import LinearFidelity, LoopEvaluation
 from studies.tuning.objective import (
-    Measured,
     Objective,
+    ScenarioFigures,
     allowed_limits,
     baseline_limits,
     judge_with_cotangents,
@@ -95,7 +95,7 @@ class Evaluator:
             if baseline is None:
                 metrics = jax.tree.map(lambda x: x[0], runs.metrics)
                 self._check_baseline(runs.status[0], metrics)
-                baseline = Measured(metrics, self.linear.baseline_terms)
+                baseline = ScenarioFigures(metrics, self.linear.baseline_terms)
             if rows.size:
                 own = jax.tree.map(lambda x, rows=rows: x[rows], loop)
                 parts.append(program.judge(self.goal, runs, own, baseline, is_differentiated[rows]))
@@ -209,7 +209,7 @@ class _PartRuns:
         goal: Objective,
         runs: _Runs,
         loop: LoopEvaluation,
-        baseline: Measured,
+        baseline: ScenarioFigures,
         is_differentiated: np.ndarray,
     ) -> _Judged:
         """Measure designs against the baseline, with derivatives of some.
@@ -223,7 +223,7 @@ class _PartRuns:
         """
         reached = baseline_limits(goal, baseline.metrics)
         allowed = [allowed_limits(goal, family, reached) for family in self._families]
-        designs = Measured(jax.tree.map(lambda x: x[1:], runs.metrics), loop.terms)
+        designs = ScenarioFigures(jax.tree.map(lambda x: x[1:], runs.metrics), loop.terms)
         judged = judge_with_cotangents(goal, designs, baseline, np.stack(allowed))
         judged = jax.tree.map(np.asarray, judged)
         slopes = self._slopes(runs.runs, judged.cotangents.metrics, is_differentiated)

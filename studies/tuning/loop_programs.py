@@ -91,7 +91,13 @@ def _loop(
         figures = {name: margin_at(response, name, place) for name, place in places.items()}
         peaks = tuple(name for name in PEAKS if name in names)
         figures |= norm_peaks(response, peaks) if peaks else {}
-    return _Loop(structure, case, matrices, figures, _decay(case, matrices))
+    return _Loop(
+        structure=structure,
+        case=case,
+        matrices=matrices,
+        figures=figures,
+        decay=_decay(case, matrices),
+    )
 
 
 # compiled without optimisation: it takes a fraction of the time

@@ -43,7 +43,7 @@ class Objective(NamedTuple):
         return _fields(self.shown)
 
 
-class Measured(NamedTuple):
+class ScenarioFigures(NamedTuple):
     """What the objective of a design is made of, in each scenario."""
 
     metrics: Metrics  # (S, ...)
@@ -91,7 +91,7 @@ def tail_weights(count: int, tail: float) -> np.ndarray:
     return np.clip(most - np.arange(count), 0.0, 1.0) / most
 
 
-def objectives(goal: Objective, design: Measured, baseline: Measured) -> Array:
+def objectives(goal: Objective, design: ScenarioFigures, baseline: ScenarioFigures) -> Array:
     """Objective in each scenario, (S,); the baseline's is 1.
 
     Sum of weight times the share of the baseline's value: of the size of a metric and of a figure
@@ -113,7 +113,7 @@ def objectives(goal: Objective, design: Measured, baseline: Measured) -> Array:
 
 
 def judge_design(
-    goal: Objective, design: Measured, baseline: Measured, allowed: Array
+    goal: Objective, design: ScenarioFigures, baseline: ScenarioFigures, allowed: Array
 ) -> tuple[Array, Array, Array]:
     """Judge a design.
 
@@ -136,7 +136,7 @@ def judge_design(
 
 @partial(jax.jit, static_argnums=0)
 def judge_designs(
-    goal: Objective, designs: Measured, baseline: Measured, allowed: Array
+    goal: Objective, designs: ScenarioFigures, baseline: ScenarioFigures, allowed: Array
 ) -> tuple[Array, Array, Array]:
     """`judge_design` for designs under the same limits, leaves (designs, S, ...)."""
     return jax.vmap(lambda x: judge_design(goal, x, baseline, allowed))(designs)
@@ -148,12 +148,12 @@ class JudgedDesigns(NamedTuple):
     objective: Array  # (designs,)
     limits: Array  # largest value over limit - 1, (designs, m)
     peaks: Array  # largest values, (designs, m)
-    cotangents: Measured  # of objective and limits, (1 + m, designs, S, ...)
+    cotangents: ScenarioFigures  # of objective and limits, (1 + m, designs, S, ...)
 
 
 @partial(jax.jit, static_argnums=0)
 def judge_with_cotangents(
-    goal: Objective, designs: Measured, baseline: Measured, allowed: Array
+    goal: Objective, designs: ScenarioFigures, baseline: ScenarioFigures, allowed: Array
 ) -> JudgedDesigns:
     """Judge designs and differentiate by what was measured.
 
@@ -164,8 +164,8 @@ def judge_with_cotangents(
         allowed: limits in each scenario, (designs, S, m).
     """
 
-    def one(design: Measured, allowed: Array) -> JudgedDesigns:
-        def figures(x: Measured) -> tuple[Array, Array]:
+    def one(design: ScenarioFigures, allowed: Array) -> JudgedDesigns:
+        def figures(x: ScenarioFigures) -> tuple[Array, Array]:
             objective, limits, peaks = judge_design(goal, x, baseline, allowed)
             return jnp.concatenate([objective[None], limits]), peaks
 

@@ -31,7 +31,7 @@ from studies.tuning.loop_figures import (
     with_decay,
 )
 from studies.tuning.objective import (
-    Measured,
+    ScenarioFigures,
     allowed_limits,
     baseline_limits,
     judge_designs,
@@ -164,7 +164,7 @@ def _evaluate(spec: TuneSpec, runs: PlainRuns, values: np.ndarray) -> tuple[np.n
     baseline, others = (jax.tree.map(lambda x, k=k: x[k], metrics) for k in (0, slice(1, None)))
     allowed = allowed_limits(goal, designs[0], baseline_limits(goal, baseline))
     terms = _terms(spec, values)
-    measured = Measured(others, terms[1:]), Measured(baseline, terms[0])
+    measured = ScenarioFigures(others, terms[1:]), ScenarioFigures(baseline, terms[0])
     objective, limits, _ = map(np.asarray, judge_designs(goal, *measured, allowed))
     is_whole = np.isin(split(result.status)[1:], status.FINISHED).all(axis=1)
     return np.where(is_whole, objective, np.nan), excess(limits)

@@ -232,6 +232,7 @@ def parse_tuning(data: dict[str, Any]) -> TuneSpec:
     moves = _moves(tune, study)
     families = _families(tune, study, free)
     _check_clashes(tune, free, families)
+    _check_switching(tune, study, families)
     _check_size(tune, families, len(moves))
     for family in families:
         for move in moves:
@@ -332,6 +333,18 @@ def _check_feedback(tune: Tune, study: Study) -> None:
                 "control.feedback",
                 study.control.feedback,
                 f"'sampled' where {path} holds " + " or ".join(of_loop),
+            )
+
+
+def _check_switching(tune: Tune, study: Study, families: tuple[Family, ...]) -> None:
+    """A law that switches between modes has a loop for each, which no term stands for."""
+    terms = [name for name in tune.objective if name in LOOP_TERMS]
+    for columns in ({}, *(family.columns for family in families)):
+        law = parts_of(study, columns).law
+        if terms and LAWS[law].is_switching:
+            raise StudyError(
+                f"tune.objective.{terms[0]}: control.law {law!r} switches between loops; allowed: "
+                "laws with one linear loop, or a limit instead"
             )
 
 
