@@ -16,7 +16,7 @@ from studies.study.margin import margin_in_db
 from studies.study.spec import paper_study
 from studies.tuning.audit import Disagreement
 from studies.tuning.check import JudgedDesign, OwnRun, patch_centers
-from studies.tuning.linear_fidelity import DesignFigures
+from studies.tuning.loop_figures import DesignFigures
 from studies.tuning.optimise import begin
 from studies.tuning.report import TuneFindings, summary
 from studies.tuning.report import report as tuning_report
@@ -369,6 +369,8 @@ def tuned():
             watched=np.full(n, 0.03),
             loop=loop,
             own_run=OwnRun(size * rng.uniform(0.9, 1.1), own, status.OK, 0.03),
+            tuned_loop={"gain_margin": np.array([loop.gain_margin])},
+            fresh_loop={"gain_margin": loop.gain_margin - np.array([0.25, 0.5, 0.125])},
         )
 
     loops = (
@@ -428,6 +430,7 @@ def test_a_tuning_s_table_of_fresh_machines():
     for name in NAMES:
         assert_cells(table[HEADS[name]], [FACTOR[name] * x.metrics[name].max() for x in designs])
     assert table["statuses"] == ["5 ok, 1 actuators saturated too often"] * 3
+    assert_cells(table["gain margin"], [x.loop.gain_margin - 0.5 for x in designs])  # the worst one
 
 
 def test_a_tuning_s_table_of_changes_has_each_move_s_own():
@@ -459,6 +462,7 @@ def test_a_tuning_s_limits_and_numbers():
         "(inactive, 75.00 % left)",
         "- all: peak_voltage at most 30 (active, 1.00 % left); gain_margin at least 1.5 "
         "(inactive, 58.33 % left)",
+        "Those of the loop: on the nominal machine, the only one of the tuning.",
         "worst disagreement is 1.5e-06 (of peak_voltage by control.gain_factor, at the best "
         "design), below 0.0001.",
         "Ended after all 20 iterations",
@@ -533,7 +537,8 @@ def test_a_tuning_s_summary_and_recommendation():
     assert "residual_rms" in better and "slowest decay" in better and "gain margin" in worse
     assert summary(spec, found) == [
         f"{name}: {x.objective.mean():.4f} of the baseline's objective on 3 fresh machines, worst "
-        f"{x.objective.max():.4f}{stop}"
+        f"{x.objective.max():.4f}; on the worst of them gain_margin {x.loop.gain_margin - 0.5:.4g}"
+        f"{stop}"
         for name, x, stop in zip(
             ("gains", "all"), found.judged, ("", "; stopped by peak_voltage"), strict=True
         )

@@ -32,9 +32,12 @@ from studies.space.spec import parse_sweep
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure
 from studies.study.spec import paper_study
 from studies.sweeps.show import ranked_cases
-from studies.tuning import linear_fidelity
+from studies.tuning import loop_figures
+from studies.tuning.check import tuned_study
 from studies.tuning.linear_fidelity import LinearFidelity
-from tests.tunings import EVERY_KIND, GAIN, SMALL, tuning
+from studies.tuning.loop_figures import machine_figures, term_values
+from studies.tuning.spec import LOOP_TERMS
+from tests.tunings import EACH, EVERY_KIND, GAIN, SMALL, tuning
 
 #: Off home, where nothing is symmetric.
 POSE = np.array([0.005, -0.003, 0.5])
@@ -450,10 +453,54 @@ def test_what_a_disk_margin_guarantees():
     np.testing.assert_allclose(phase, [0.0, 2 * np.rad2deg(np.arctan(0.5)), 90.0])
 
 
+def linear_tuning(limits, objective):
+    """Loops of four designs on two machines, and what they do where the first gain moves."""
+    spec = tuning(
+        {**GAIN, "drive.kp": EVERY_KIND["drive.kp"]},
+        limits=limits,
+        objective=objective,
+        scenarios={"count": 2, "spread": {"control.velocity_gain[0]": 20.0}, **EACH},
+    )
+    linear = LinearFidelity(spec, [spec.families[0]] * 4)
+    step = np.array([2e-3, 0.0])  # peaks are found to 1e-6
+    steps = np.stack([0 * step, step, -step])
+    designs = np.concatenate([[0.4, 2e4] * (1 + steps), [[200.0, 2e4]]])
+    found = linear.evaluate(designs)
+
+    def check(values, slopes):
+        wanted = (values[1] - values[2]) / (designs[1, 0] - designs[2, 0])
+        np.testing.assert_allclose(slopes[0, ..., 0], wanted, rtol=1e-4, atol=1e-6)
+
+    check(found.limits, found.limit_slopes)
+    check(found.terms, found.term_slopes)
+    assert np.isfinite(found.limit_slopes).all()
+    assert (found.limits[3] > 0).all()  # unstable
+    assert np.isnan(found.terms[3]).all() and np.isfinite(found.terms[:3]).all()
+    return spec, linear, designs, found
+
+
+def test_the_worst_machine_counts_in_tunings(monkeypatch):
+    """With its derivatives, and each machine's own in an objective; the nominal one is better."""
+    monkeypatch.setattr(loop_figures, "MARGIN_MODES", 4)
+    spec, linear, designs, found = linear_tuning({"disk_margin": 0.8}, {"disk_margin": 1.0})
+    assert linear.machines.of_scenario.tolist() == [0, 1, 0, 1]
+    np.testing.assert_array_equal(found.terms[:, 0], found.terms[:, 2])  # moves do not matter
+    nominal, other = found.terms[0, :2, 0]
+    x = 1 - min(nominal, other) / 0.8
+    np.testing.assert_allclose(found.limits[0, 0], x / (1 + abs(x)), rtol=1e-9)
+    worst = int(other < nominal)
+    chained = -found.term_slopes[0, worst, 0] / 0.8 / (1 + abs(x)) ** 2
+    np.testing.assert_allclose(found.limit_slopes[0, 0], chained, rtol=1e-9)
+    assert worst == 1 and other < 0.999 * nominal
+    assert np.abs(found.term_slopes[0, 0] / found.term_slopes[0, 1] - 1).min() > 1e-3
+    beyond = linear.beyond(0, designs)
+    assert (beyond[:3] < 0).all() and beyond[3] == 1.0
+
+
 @pytest.mark.long
-def test_limits_of_tunings_have_the_gradients_of_differences(monkeypatch):
+def test_figures_of_tunings_have_the_gradients_of_differences(monkeypatch):
     """Of every figure, also of an unstable design, whose limits are violated."""
-    monkeypatch.setattr(linear_fidelity, "MARGIN_MODES", 4)
+    monkeypatch.setattr(loop_figures, "MARGIN_MODES", 4)
     limits = {
         "disk_margin": 0.8,
         "phase_margin": 40.0,
@@ -462,15 +509,21 @@ def test_limits_of_tunings_have_the_gradients_of_differences(monkeypatch):
         "control_effort_peak": 20.0,
         "disturbance_deflection_peak": 5e-5,
     }
-    spec = tuning({**GAIN, "drive.kp": EVERY_KIND["drive.kp"]}, limits=limits)
-    linear = LinearFidelity(spec, [spec.families[0]] * 4)
-    steps = np.array([[0.0, 0.0], [1e-5, 0.0], [-1e-5, 0.0]])
-    designs = np.concatenate([[0.4, 2e4] * (1 + steps), [[200.0, 2e4]]])
-    excess, slopes = linear.limits(designs)
-    wanted = (excess[1] - excess[2]) / (designs[1, 0] - designs[2, 0])
-    np.testing.assert_allclose(slopes[0, :, 0], wanted, rtol=1e-4, atol=1e-6)
-    assert np.isfinite(slopes).all()
-    assert (excess[3] > 0).all()
+    linear_tuning(limits, dict.fromkeys(LOOP_TERMS, 1.0))
+
+
+@pytest.mark.long
+def test_programs_of_tunings_have_the_figures_of_the_host():
+    """On every machine, with all its modes: derivatives come with values that judge results."""
+    names = dict.fromkeys(LOOP_TERMS, 1.0)
+    spec, linear, designs, found = linear_tuning({}, names)
+    np.testing.assert_allclose(linear.plain_terms(0, designs)[:3], found.terms[:3], rtol=1e-4)
+    study = tuned_study(spec, spec.families[0], designs[0])
+    figures = machine_figures(spec, study, linear.machines.columns, tuple(names))
+    own = term_values(tuple(names), figures, linear.machines.of_scenario)
+    np.testing.assert_allclose(own, found.terms[0], rtol=1e-4)
+    baseline = np.tile(spec.free.values(spec.free.places()), (4, 1))
+    np.testing.assert_allclose(linear.evaluate(baseline).terms[0], linear.baseline_terms, rtol=1e-4)
 
 
 @pytest.mark.long

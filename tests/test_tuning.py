@@ -16,22 +16,23 @@ from studies.errors import StudyError
 from studies.space.axes import Range
 from studies.space.free import Free, FreeNumbers
 from studies.study.spec import paper_study
-from studies.tuning import linear_fidelity
+from studies.tuning import loop_figures
 from studies.tuning.check import tuned_study
 from studies.tuning.evaluate import Evaluation
 from studies.tuning.folder import load_progress, save_progress
-from studies.tuning.linear_fidelity import loop_figures
+from studies.tuning.linear_fidelity import LinearFidelity
+from studies.tuning.loop_figures import machine_figures
 from studies.tuning.optimise import advance, begin, optimise, start_families
 from studies.tuning.report import violated_limits
 from studies.tuning.run import make_evaluator
-from studies.tuning.scenarios import scenario_columns
+from studies.tuning.scenarios import scenario_columns, tuned_machines
 from studies.tuning.spec import Family, Tune, TuneSpec
 from tests.tunings import EACH, EVERY_KIND, GAIN, tuning
 
 # --- objective and limits -------------------------------------------------------------------------
 
 JUDGED = {
-    "objective": {"residual_rms": 1.0, "control_energy": 0.1},
+    "objective": {"residual_rms": 1.0, "control_energy": 0.1, "slowest_decay": 0.2},
     "limits": {
         "peak_voltage": "baseline",
         "gain_margin": 4.0,
@@ -58,7 +59,7 @@ def judged():
     }
     spec = tuning({**free, "placement": {"kind": "same"}}, **JUDGED, starts=STARTS, iterations=6)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(linear_fidelity, "MARGIN_MODES", 4)  # a third of the time to compile
+        patch.setattr(loop_figures, "MARGIN_MODES", 4)  # a third of the time to compile
         yield spec, make_evaluator(spec)
 
 
@@ -109,6 +110,7 @@ def test_figures_can_be_recomputed_from_runs(evaluated):
             "link__youngs_modulus": float(columns["link.youngs_modulus"][k]),
             "motion__move_time": float(columns["motion.move_time"][k]),
         }
+        machine = {"link.youngs_modulus": columns["link.youngs_modulus"][[k]]}
         tuned = {
             "control__gain_factor": float(values[0]),
             "control__velocity_gain": (float(values[1]), *spec.study.control.velocity_gain[1:]),
@@ -122,25 +124,65 @@ def test_figures_can_be_recomputed_from_runs(evaluated):
             np.sqrt(np.mean(getattr(after, name) ** 2) / np.mean(getattr(before, name) ** 2))
             for name in ("residual_rms", "control_energy")
         ]
-        objective.append((shares[0] + 0.1 * shares[1]) / 1.1)
+        loops = [
+            machine_figures(spec, study, machine, ("slowest_decay",))["slowest_decay"][0]
+            for study in (spec.study, spec.study.change(**tuned))
+        ]
+        shares.append(loops[0] / loops[1])  # more is better
+        objective.append(np.dot(shares, (1.0, 0.1, 0.2)) / 1.3)
         excess.append(after.peak_voltage.max() / before.peak_voltage.max() - 1)
     assert len(set(objective)) == 4
     np.testing.assert_allclose(part.objective[0], np.mean(objective), rtol=1e-7)
     np.testing.assert_allclose(part.limits[0, 0], np.max(excess), rtol=1e-6)
 
 
-def test_limits_of_the_loop_are_those_of_its_figures(evaluated):
+def test_limits_of_the_loop_are_those_of_the_worst_machine(evaluated):
     spec, u, found = evaluated
+    machines, names = tuned_machines(spec).columns, spec.loop_limits
+    assert len(machines["link.youngs_modulus"]) == 2
     for position, first in ((0, 0), (1, STARTS)):
         study = tuned_study(spec, spec.moving[position], spec.free.values(u))
-        loop, limits = loop_figures(spec, study), found[0, 1, 2].limits[first, 1:]
-        assert (limits[0] > 0) == (loop.gain_margin < 4.0) and abs(loop.gain_margin - 4) > 0.01
-        for value, wanted in (
-            (limits[1], 1 - loop.slowest_decay / 20.0),
-            (limits[2], loop.spillover / 1.1 - 1),
-            (limits[3], 1 - loop.singularity_distance / 0.1),
+        loop, limits = (
+            machine_figures(spec, study, machines, names),
+            found[0, 1, 2].limits[first, 1:],
+        )
+        margin = loop["gain_margin"].min()
+        assert (limits[0] > 0) == (margin < 4.0) and abs(margin - 4) > 0.01
+        for value, excess in (
+            (limits[1], 1 - loop["slowest_decay"] / 20.0),
+            (limits[2], loop["spillover"] / 1.1 - 1),
+            (limits[3], 1 - loop["singularity_distance"] / 0.1),
         ):
+            wanted = excess.max()
             np.testing.assert_allclose(value, wanted / (1 + abs(wanted)), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("tune", "message"),
+    [
+        ({"objective": {"slowest_decay": 1.0}}, "tune.objective.slowest_decay: the loop of"),
+        ({"limits": {"slowest_decay": "baseline"}}, "tune.limits.slowest_decay = 'baseline': the"),
+    ],
+)
+def test_a_baseline_needs_a_stable_loop_to_be_measured_against(tune, message):
+    """On every machine."""
+    text = " baseline is unstable on machine 2 of 2, .*; allowed: > 0 on every machine of tune"
+    weak = {"count": 2, "check": 1, "machines": {"control.velocity_gain": [[3e3] * 3] * 2}}
+    spec = tuning({"drive.kp": EVERY_KIND["drive.kp"]}, scenarios=weak, **tune)
+    with pytest.raises(StudyError, match=message + ".*" + text.strip()):
+        LinearFidelity(spec, list(spec.families))
+
+
+@pytest.mark.long
+def test_an_objective_can_be_of_the_loop_alone():
+    spec = tuning(GAIN, objective={"slowest_decay": 1.0}, starts=3)
+    evaluator = make_evaluator(spec)
+    values = spec.free.values(spec.free.places())
+    found = evaluator.evaluate(values * np.array([[1.0], [1.001], [0.999]]))
+    slope = (found.objective[1] - found.objective[2]) / (0.002 * values[0])
+    np.testing.assert_allclose(found.objective[0], 1.0, rtol=1e-6)
+    np.testing.assert_allclose(found.slope[0, 0], slope, rtol=1e-4)
+    assert (found.status == 0).all() and slope != 0
 
 
 # --- downhill -------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from studies.tuning.audit import Disagreement
 from studies.tuning.check import JudgedDesign, OwnRun
 from studies.tuning.evaluate import Evaluation, Evaluator
 from studies.tuning.folder import open_tuning
-from studies.tuning.linear_fidelity import DesignFigures
+from studies.tuning.loop_figures import DesignFigures
 from studies.tuning.objective import objective_of
 from studies.tuning.optimise import begin, is_compatible
 from studies.tuning.report import TuneFindings, n_outside, report
@@ -147,6 +147,69 @@ def check_explorer(out):
     manifest.write_text(before.replace('"iterations": 3', '"iterations": 7'))
     assert stale in explore_results(out).read_text(encoding="utf-8")
     manifest.write_text(before)
+
+
+def test_a_baseline_without_a_stable_loop_is_refused(tmp_path, capsys):
+    file = tmp_path / "t.toml"
+    limits = 'limits = { peak_voltage = "baseline", gain_margin = 1.0 }'
+    assert limits in FILE
+    text = FILE.replace(
+        limits, 'limits = { peak_voltage = "baseline" }\nobjective = { spillover = 1 }'
+    )
+    file.write_text(text.replace("ratios =", "velocity_gain = [3e3, 3e3, 3e3], ratios ="))
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["tune", str(file), "--out", str(tmp_path / "out"), "--quiet"])
+    message = capsys.readouterr().err
+    assert "tune.objective.spillover: the loop of the baseline is unstable on machine 1" in message
+    assert "1/s; allowed: > 0 on every machine" in message and "Traceback" not in message
+
+
+@pytest.mark.long
+def test_a_margin_can_be_a_goal_beside_a_metric(tmp_path, capsys):
+    """Both improve; the tables say on which machines, from the studies' own loops."""
+    file, out = tmp_path / "t.toml", tmp_path / "out"
+    free = '[tune.free]\n"control.gain_factor" = { from = 0.05, to = 2.0, scale = "log" }\n'
+    wanted = """
+starts = 2
+iterations = 5
+samples = 20
+objective = { residual_rms = 1.0, disk_margin = 0.5 }
+limits = { disk_margin = "baseline" }
+scenarios = { count = 2, check = 3, spread = { "link.youngs_modulus" = 5.0 } }
+"""
+    file.write_text(FILE.partition("starts =")[0] + wanted + free)
+    cli.main(["tune", str(file), "--out", str(out)])
+    said = capsys.readouterr().out
+    data, text = read_store(out / "tune.h5")[0], text_of((out / "report.html").read_text())
+    own, fresh = (
+        table_of(text, f"On {x} machine{y}") for x, y in (("the nominal", ""), ("fresh", "s"))
+    )
+    assert float(fresh["tuned"]["objective, worst"]) < 0.9
+    for table in (own, fresh):
+        rms, margin = (
+            [float(table[x][y]) for x in ("tuned", "baseline")]
+            for y in ("residual_rms [µm]", "disk margin")
+        )
+        assert rms[0] < rms[1] and margin[0] > 1.1 * margin[1]
+    assert "on the worst of 2 machines, the nominal one among them" in text
+    margins = []
+    for name in ("tuned", "study"):
+        study = load_study(out / f"{name}.toml")
+        machines = [study.change(link__youngs_modulus=x) for x in data["link.youngs_modulus"].data]
+        margins.append(
+            [
+                run_study(x, has_record=False, has_margins=True).loop.robustness["disk_margin"]
+                for x in (*machines, study)
+            ]
+        )
+    np.testing.assert_allclose(data["fresh_disk_margin"].data[0], margins[0][:3], rtol=1e-4)
+    np.testing.assert_allclose(data["fresh_baseline_disk_margin"].data, margins[1][:3], rtol=1e-4)
+    assert same(fresh["tuned"]["disk margin"], min(margins[0][:3]))
+    assert same(own["tuned"]["disk margin"], margins[0][3])
+    metric = data["fresh_residual_rms"].data[0], data["baseline_residual_rms"].data
+    assert f"on the worst of them disk_margin {min(margins[0][:3]):.4g}" in said
+    assert metric[0].mean() < metric[1].mean()
+    cli.main(["tune", str(file), "--audit"])
 
 
 def test_a_report_says_what_its_numbers_are():

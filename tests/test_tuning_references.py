@@ -7,9 +7,9 @@ from studies.engine.frame import frame_of
 from studies.engine.function import TRACES
 from studies.engine.preflight import check_run
 from studies.engine.runs import run_study
-from studies.tuning import linear_fidelity, references
+from studies.tuning import loop_figures, references
 from studies.tuning.check import fresh_columns
-from studies.tuning.linear_fidelity import loop_figures
+from studies.tuning.loop_figures import machine_figures
 from studies.tuning.references import (
     ALONE,
     WITHOUT,
@@ -18,7 +18,7 @@ from studies.tuning.references import (
     resolution_lines,
     scan_gain,
 )
-from studies.tuning.scenarios import scenario_columns
+from studies.tuning.scenarios import scenario_columns, tuned_machines
 from tests.tunings import EVERY_KIND, GAIN, tuning
 
 FREE = {"control.velocity_gain[0]": EVERY_KIND["control.velocity_gain"]}
@@ -49,13 +49,19 @@ def compared():
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(references, "COUNT", 7)
-        patch.setattr(linear_fidelity, "MARGIN_MODES", 4)  # a third of the time to compile
+        patch.setattr(loop_figures, "MARGIN_MODES", 4)  # a third of the time to compile
         before = len(TRACES)
         found = compare(spec, [spec.study], lambda text: None)
         assert len(TRACES) == before + 1  # the scan takes the program of the fresh machines
         scan = found[2].scan
+        machines = tuned_machines(spec).columns
         loops = [
-            loop_figures(spec, spec.study.change(control__gain_factor=float(g)))
+            machine_figures(
+                spec,
+                spec.study.change(control__gain_factor=float(g)),
+                machines,
+                ("gain_margin",),
+            )
             for g in scan.gain_factor
         ]
     return spec, found, loops
@@ -75,7 +81,7 @@ def test_the_gain_factor_alone_is_the_best_feasible_of_all(compared):
     np.testing.assert_allclose(scan.objective, objective.mean(axis=1), rtol=1e-9)
     is_kept = peaks.max(axis=1) <= LIMITS["peak_voltage"]
     np.testing.assert_array_equal(scan.excess == 0, is_kept)
-    is_safe = np.array([x.gain_margin for x in loops]) >= LIMITS["gain_margin"]
+    is_safe = np.array([x["gain_margin"].min() for x in loops]) >= LIMITS["gain_margin"]
     value = objective.mean(axis=1)
     best = [
         np.nanargmin(np.where(ok, value, np.nan)) for ok in (value > 0, is_kept, is_kept & is_safe)

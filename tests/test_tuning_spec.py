@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 
+from jaxmodel.metrics import Metrics
 from studies.errors import StudyError
 from studies.study import spec as spec_module
 from studies.study.cases import as_arrays, build_case, build_structure
@@ -13,8 +14,13 @@ from studies.study.numbers import one_study
 from studies.study.paths import Parts, set_value
 from studies.study.spec import parse_study
 from studies.tuning.evaluate import Evaluator
-from studies.tuning.objective import tail_weights
-from studies.tuning.scenarios import lane_columns, scenario_columns
+from studies.tuning.objective import (
+    ScenarioFigures,
+    judge_with_cotangents,
+    objective_of,
+    tail_weights,
+)
+from studies.tuning.scenarios import lane_columns, scenario_columns, tuned_machines
 from studies.tuning.spec import load_tuning, parse_tuning
 from tests.tunings import EVERY_KIND, GAIN, SMALL, tuning
 
@@ -184,7 +190,25 @@ def deep(n):
         ({"free": {"placement": {"from": 0, "to": 1}}}, "allowed: {kind = 'same'}"),
         ({"free": GAIN, "objective": {"residual": 1.0}}, "did you mean 'residual_rms'"),
         ({"free": GAIN, "objective": {"residual_rms": -1.0}}, "allowed: a number > 0"),
-        ({"free": GAIN, "objective": {"gain_margin": 1.0}}, "'gain_margin': unknown metric"),
+        (
+            {"free": GAIN, "objective": {"gain_margin": 1.0}},
+            "tune.objective: 'gain_margin' can only be a limit, it has no derivative; take disk_m",
+        ),
+        (
+            {"free": GAIN, "objective": {"singularity_distance": 1.0}},
+            "tune.objective: 'singularity_distance' can only be a limit$",
+        ),
+        ({"free": GAIN, "objective": {"disc_margin": 1.0}}, "did you mean 'disk_margin'"),
+        (
+            {
+                "free": GAIN,
+                "objective": {"disk_margin": 1.0},
+                "families": {"one": {"set": {"control.law": "modified_imsc"}}},
+            },
+            "tune.objective.disk_margin: control.law 'modified_imsc' switches between loops",
+        ),
+        ({"free": GAIN, "objective": {"disk_margin[1]": 1.0}}, "no such entry; allowed: disk_marg"),
+        ({"free": GAIN, "objective": {"disk_margin": 0.0}}, "disk_margin = 0.0; allowed: a number"),
         ({"free": GAIN, "limits": {"peak_volt": 1.0}}, "did you mean 'peak_voltage'"),
         (
             {"free": GAIN, "objective": {"residual_rms[3]": 1.0}},
@@ -399,6 +423,79 @@ def test_three_values_are_spread_together_on_every_move():
     share = column / own
     np.testing.assert_allclose(share, share[:, :1] * np.ones(3))
     assert 0 < np.abs(share - 1).max() <= 0.05
+
+
+def test_figures_of_the_loop_need_one():
+    control = {**SMALL["control"], "feedback": "ideal"}
+    for tune in ({"objective": {"disk_margin": 1.0}}, {"limits": {"disk_margin": 1.0}}):
+        message = f"'sampled' where tune.{next(iter(tune))} holds disk_margin"
+        with pytest.raises(StudyError, match=message):
+            parse_tuning({**SMALL, "control": control, "tune": {"free": GAIN, **tune}})
+
+
+def test_the_loop_of_a_machine_counts_once():
+    """Neither moves nor noise change it, nor a machine that equals the nominal one."""
+    each = {"motion.move_time": [0.03, 0.035]}
+    alike = tuned_machines(tuning(GAIN, scenarios={"count": 3, "each": each}))
+    assert alike.size == 1 and alike.of_scenario.tolist() == [0] * 6
+    spread = tuned_machines(
+        tuning(GAIN, scenarios={"count": 3, "each": each, "spread": {"link.density": 5.0}})
+    )
+    assert spread.size == 3 and spread.of_scenario.tolist() == [0, 1, 2, 0, 1, 2]
+    spec = tuning(
+        GAIN,
+        scenarios={
+            "count": 4,
+            "check": 1,
+            "machines": {"link.density": [2600.0, 2750.0, 2600.0, 2700.0]},
+        },
+    )
+    given = tuned_machines(spec)
+    assert spec.study.link.density == 2750.0
+    np.testing.assert_array_equal(given.columns["link.density"], [2750.0, 2600.0])
+    assert given.of_scenario.tolist() == [0, 1, 0, 1]
+
+
+def test_parameters_of_any_law_of_a_family_make_machines_differ():
+    """Also those that the baseline's law does not have."""
+    spec = tuning(
+        {"control.laws.lqg.voltage_weight": {"from": 1e-9, "to": 1e-3, "scale": "log"}},
+        families={"lqg": {"set": {"control.law": "lqg"}}},
+        scenarios={"count": 2, "spread": {"control.laws.lqg.sensor_noise": 5.0}},
+    )
+    assert tuned_machines(spec).size == 2
+
+
+@pytest.mark.parametrize("tail", [1.0, 0.5, 0.0])
+def test_the_tail_is_that_of_metrics_and_loops_together(tail):
+    """By hand: of three scenarios on two machines; more of a margin is better."""
+    weights = {"disk_margin": 1.0, "residual_rms": 2.0, "sensitivity_peak": 1.0}
+    goal = objective_of(tuning(GAIN, objective=weights, scenarios={"tail": tail}))
+    assert dict(goal.terms) == {"residual_rms": 0.5} and goal.metrics == ("residual_rms",)
+    assert dict(goal.loop) == {"disk_margin": 0.25, "sensitivity_peak": 0.25}
+    rms, margin, peak = np.array([2.0, 1.0, 3.0]), np.array([0.5, 2.0, 0.5]), np.array([3, 1, 3.0])
+
+    def measured(rms, margin, peak):
+        metrics = Metrics({"residual_rms": rms[:, None, None] * np.ones((3, 3))})
+        return ScenarioFigures(metrics, np.stack([margin, peak], axis=1))
+
+    one = np.ones(3)
+    shares = 0.5 * rms / 4 + 0.25 * 1.0 / margin + 0.25 * peak / 2
+    worst = np.sort(shares)[::-1]
+    designs = jax.tree.map(lambda x: x[None], measured(rms, margin, peak))
+    judged = judge_with_cotangents(
+        goal, designs, measured(4 * one, one, 2 * one), np.zeros((1, 3, 0))
+    )
+    share = tail_weights(3, tail)
+    np.testing.assert_allclose(judged.objective, [worst @ share])
+    weight = share[np.argsort(np.argsort(-shares))]
+    by_loop = np.stack([-0.25 * weight / margin**2, 0.125 * weight], axis=1)
+    np.testing.assert_allclose(judged.cotangents.loop[0, 0], by_loop)
+    unstable = designs._replace(loop=np.where([[[0], [1], [0]]], np.nan, designs.loop))
+    judged = judge_with_cotangents(
+        goal, unstable, measured(4 * one, one, 2 * one), np.zeros((1, 3, 0))
+    )
+    assert np.isnan(judged.objective).all()
 
 
 def test_machines_are_given_one_by_one():

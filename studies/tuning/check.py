@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -24,8 +26,16 @@ from studies.study.paths import Parts, parts_of, set_values
 from studies.study.spec import Study, parse_study
 from studies.tuning.evaluate import first_residual, tuned_structure
 from studies.tuning.free import PLACEMENT
-from studies.tuning.linear_fidelity import DesignFigures, loop_figures
+from studies.tuning.linear_fidelity import LinearFidelity
+from studies.tuning.loop_figures import (
+    DesignFigures,
+    loop_figures,
+    machine_figures,
+    term_values,
+    with_decay,
+)
 from studies.tuning.objective import (
+    ScenarioFigures,
     allowed_limits,
     baseline_limits,
     judge_designs,
@@ -33,8 +43,14 @@ from studies.tuning.objective import (
     objective_of,
     objectives,
 )
-from studies.tuning.optimise import excess
-from studies.tuning.scenarios import lane_columns, scenario_columns
+from studies.tuning.optimise import KEPT, excess
+from studies.tuning.scenarios import (
+    LoopMachines,
+    lane_columns,
+    loop_machines,
+    scenario_columns,
+    tuned_machines,
+)
 from studies.tuning.spec import Family, TuneSpec
 
 #: Random designs per chunk.
@@ -44,13 +60,17 @@ CHUNK = 256
 class JudgedDesign(NamedTuple):
     """One design: on fresh scenarios, machine by machine within each move, and as in its file."""
 
-    objective: np.ndarray  # nan if a run did not finish, (S,)
+    #: nan if a run did not finish or a loop in the objective is unstable, (S,)
+    objective: np.ndarray
     metrics: dict[str, np.ndarray]  # largest entry of the links that count, (S,)
     status: np.ndarray  # (S,)
     watched: np.ndarray  # from the end of the command to that of the run [s], (S,)
     loop: DesignFigures | None  # None with other feedback than sampled
     own_run: OwnRun
     poles: PoleReport | None = None  # where the design's gains follow from poles
+    #: `TuneSpec.loop_names` on the machines of the tuning and on fresh ones, (machines,) each
+    tuned_loop: Mapping[str, np.ndarray] = MappingProxyType({})
+    fresh_loop: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
 class OwnRun(NamedTuple):
@@ -65,11 +85,13 @@ class OwnRun(NamedTuple):
 class RandomSearch(NamedTuple):
     """Random designs of the family with the most free parameters, on the tuning's scenarios."""
 
-    objective: np.ndarray  # nan if a run did not finish, (n,)
+    #: nan if a run did not finish or a loop in the objective is unstable, (n,)
+    objective: np.ndarray
     limits: np.ndarray  # largest value over limit - 1 of the metrics with a limit, (n, m)
     peaks: np.ndarray  # largest values, (n, m)
-    beyond_loop: np.ndarray  # largest excess over limits of the loop (see `screen`); inf where
-    #: other limits are not kept, (n,)
+    #: largest excess over limits of the loop on the machines of the tuning, as a share, or by
+    #: `screen` where that is larger; inf where other limits are not kept, (n,)
+    beyond_loop: np.ndarray
     linear: np.ndarray  # linear residual vibration, nan there [m], (n,)
     residual: np.ndarray  # that of the first scenario's run, nan where not judged by it [m], (n,)
     run_time: float  # of one run, among those of a whole chunk [s]
@@ -178,31 +200,68 @@ def judge(spec: TuneSpec, designs: list[Study], runs: PartRuns) -> list[JudgedDe
     columns, goal = fresh_columns(spec), objective_of(spec)
     count = len(columns["run.seed"])
     by_design = _run_designs(designs, columns, runs)
-    metrics = by_design.metrics
-    baseline = jax.tree.map(lambda x: x[0], metrics)
+    fresh = loop_machines(spec, columns)
+    loops = [_loops(spec, study, fresh) for study in designs]
+    terms = np.stack([_terms(spec, loop, fresh) for loop in loops])
+    measured = ScenarioFigures(by_design.metrics, terms)
+    baseline = jax.tree.map(lambda x: x[0], measured)
     end = runs.of(spec.parts()).structure.n_steps / spec.study.electronics.sample_rate_hz
     judged = []
-    for k, study in enumerate(designs):
-        of_design = jax.tree.map(lambda x, k=k: x[k], metrics)
+    for k, loop in enumerate(loops):
+        of_design = jax.tree.map(lambda x, k=k: x[k], measured)
         codes, watched = by_design.status[k], end - by_design.command_end[k]
         objective = np.asarray(objectives(goal, of_design, baseline))
-        values = {name: np.asarray(largest(goal, of_design, name)) for name in goal.shown}
+        values = {name: np.asarray(largest(goal, of_design.metrics, name)) for name in goal.shown}
         judged.append(
             JudgedDesign(
                 objective=np.where(np.isin(codes, status.FINISHED), objective, np.nan)[:count],
                 metrics={name: x[:count] for name, x in values.items()},
                 status=codes[:count],
                 watched=watched[:count],
-                loop=loop_figures(spec, study) if study.control.feedback == "sampled" else None,
+                loop=loop.file,
                 own_run=OwnRun(
                     objective=float(objective[count]),
                     metrics={name: float(x[count]) for name, x in values.items()},
                     status=int(codes[count]),
                     watched=float(watched[count]),
                 ),
+                tuned_loop=loop.tuned,
+                fresh_loop=loop.fresh,
             )
         )
     return [_with_poles(study, design) for study, design in zip(designs, judged, strict=True)]
+
+
+class _DesignLoops(NamedTuple):
+    """Figures of a design's loops."""
+
+    file: DesignFigures | None  # as in its file; None with other feedback than sampled
+    tuned: dict[str, np.ndarray]  # on the machines of the tuning, (machines,)
+    fresh: dict[str, np.ndarray]  # on fresh ones, (machines,)
+
+
+def _loops(spec: TuneSpec, study: Study, fresh: LoopMachines) -> _DesignLoops:
+    names = spec.loop_names
+    of_fresh = tuple(dict.fromkeys((*names, *with_decay(spec.loop_terms))))
+    return _DesignLoops(
+        file=loop_figures(spec, study) if study.control.feedback == "sampled" else None,
+        tuned=machine_figures(spec, study, tuned_machines(spec).columns, names) if names else {},
+        fresh=machine_figures(spec, study, fresh.columns, of_fresh) if names else {},
+    )
+
+
+def _terms(spec: TuneSpec, loop: _DesignLoops, fresh: LoopMachines) -> np.ndarray:
+    """Terms of the objective in fresh scenarios, then as in the design's file, (S + 1, t)."""
+    names, count = spec.loop_terms, len(fresh.of_scenario)
+    if loop.file is None or not names:
+        return np.zeros((count + 1, 0))
+    file = {name: np.array([getattr(loop.file, name)]) for name in with_decay(names)}
+    return np.concatenate(
+        [
+            term_values(names, loop.fresh, fresh.of_scenario),
+            term_values(names, file, np.zeros(1, int)),
+        ]
+    )
 
 
 def _run_designs(designs: list[Study], columns: dict[str, np.ndarray], runs: PartRuns) -> Result:
@@ -249,12 +308,13 @@ def shown_structure(spec: TuneSpec, parts: Parts) -> Structure:
     return tuned_structure(spec, parts)._replace(metrics=objective_of(spec).shown_metrics)
 
 
-def search(spec: TuneSpec, screen: Any) -> RandomSearch:
+def search(spec: TuneSpec, linear: LinearFidelity, position: int) -> RandomSearch:
     """Run random designs (Sobol points between the bounds) on the scenarios of the tuning.
 
     Args:
         spec: of the tuning.
-        screen: function of values (n, p) of the main family: see `LinearFidelity.screen`.
+        linear: of its designs.
+        position: index of a design of the main family among them.
     """
     family = spec.families[spec.main]
     own_place = spec.free.places()
@@ -282,6 +342,7 @@ def search(spec: TuneSpec, screen: Any) -> RandomSearch:
     batches, spent = [], 0.0
     for first in range(0, n, CHUNK):
         part = values[np.minimum(np.arange(first, first + CHUNK), n - 1)]
+        terms = linear.plain_terms(position, part)
         part = np.concatenate([np.full((1, part.shape[1]), np.nan), part])
         whole = jax.tree.map(lambda x: np.broadcast_to(x, (layout.size, *x.shape[1:])), numbers)
         cases = jax.tree.map(np.asarray, build(whole, part[rows // count]))
@@ -292,21 +353,24 @@ def search(spec: TuneSpec, screen: Any) -> RandomSearch:
         baseline, others = (jax.tree.map(lambda x, k=k: x[k], metrics) for k in (0, slice(1, None)))
         baseline = baseline if measure is None else measure
         allowed = allowed_limits(goal, family, baseline_limits(goal, baseline))
-        judgement = judge_designs(goal, others, baseline, allowed)
+        measured = ScenarioFigures(others, terms), ScenarioFigures(baseline, linear.baseline_terms)
+        judgement = judge_designs(goal, *measured, allowed)
         batches.append((*map(np.asarray, judgement), first_residual(goal, metrics)[1:]))
     objective, limits, peaks, residual = (np.concatenate(x)[:n] for x in zip(*batches, strict=True))
     spent -= executor.compile_time
-    beyond, linear = np.full(n, np.inf), np.full(n, np.nan)
+    beyond, residuals = np.full(n, np.inf), np.full(n, np.nan)
     kept = np.isfinite(objective) & (excess(limits) == 0)
     if kept.any():
-        beyond[kept], linear[kept] = screen(values[kept])
+        beyond[kept], residuals[kept] = linear.screen(position, values[kept])
+        passed = kept & (beyond <= KEPT)
+        beyond[passed] = np.maximum(beyond[passed], linear.beyond(position, values[passed]))
     run_time = spent / (-(-n // CHUNK) * count * (1 + CHUNK))
     return RandomSearch(
         objective=objective,
         limits=limits,
         peaks=peaks,
         beyond_loop=beyond,
-        linear=linear,
+        linear=residuals,
         residual=residual,
         run_time=run_time,
         runs=n * count,

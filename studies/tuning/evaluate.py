@@ -23,9 +23,10 @@ from studies.errors import StudyError
 from studies.study.cases import build_structure, in_working_precision
 from studies.study.numbers import study_numbers
 from studies.study.paths import Parts
-from studies.tuning.linear_fidelity import LinearFidelity
+from studies.tuning.linear_fidelity import LinearFidelity, LoopEvaluation
 from studies.tuning.objective import (
     Objective,
+    ScenarioFigures,
     allowed_limits,
     baseline_limits,
     judge_with_cotangents,
@@ -40,7 +41,8 @@ from studies.tuning.spec import BASELINE, Family, TuneSpec
 class Evaluation(NamedTuple):
     """Designs and their derivatives; NumPy arrays."""
 
-    objective: np.ndarray  # (designs,), nan if a scenario did not finish
+    #: (designs,), nan if a scenario did not finish or a loop in the objective is unstable
+    objective: np.ndarray
     slope: np.ndarray  # by the free parameters, 0 for those that do not move, (designs, p)
     limits: np.ndarray  # value over limit - 1, positive where violated, (designs, m)
     limit_slope: np.ndarray  # (designs, m, p)
@@ -59,7 +61,7 @@ class Evaluator:
             families: of each design of a batch.
 
         Raises:
-            StudyError: as `check_run`; the baseline does not finish a run.
+            StudyError: as `check_run` and `LinearFidelity`; the baseline does not finish a run.
         """
         self.spec, self.families = spec, families
         self.goal, self.linear = objective_of(spec), LinearFidelity(spec, families)
@@ -85,28 +87,30 @@ class Evaluator:
         is_compiled = all(program.is_compiled for program in self._programs)
         started = time.perf_counter()
         is_differentiated = (np.isfinite(values) & np.reshape(needs_gradient, (-1, 1))).any(axis=1)
+        loop = self.linear.evaluate(values)
         baseline, parts, order = None, [], []
         for program in self._programs:
             rows = program.rows
             runs = program.run(values[rows])
             if baseline is None:
-                baseline = jax.tree.map(lambda x: x[0], runs.metrics)
-                self._check_baseline(runs.status[0], baseline)
+                metrics = jax.tree.map(lambda x: x[0], runs.metrics)
+                self._check_baseline(runs.status[0], metrics)
+                baseline = ScenarioFigures(metrics, self.linear.baseline_terms)
             if rows.size:
-                parts.append(program.judge(self.goal, runs, baseline, is_differentiated[rows]))
+                own = jax.tree.map(lambda x, rows=rows: x[rows], loop)
+                parts.append(program.judge(self.goal, runs, own, baseline, is_differentiated[rows]))
                 order.append(rows)
         back = np.argsort(np.concatenate(order))
         whole = _Judged(*(np.concatenate(x)[back] for x in zip(*parts, strict=True)))
         if is_compiled:
             self.run_time = (time.perf_counter() - started) / self.lanes
-        beyond, change = self.linear.limits(values)
-        limit_slope = np.concatenate([whole.slopes[:, 1:], change], axis=1)
+        limit_slope = np.concatenate([whole.slopes[:, 1:], loop.limit_slopes], axis=1)
         return Evaluation(
             objective=whole.objective,
             slope=np.where(self.is_free, whole.slopes[:, 0], 0.0),
-            limits=np.concatenate([whole.limits, beyond], axis=1),
+            limits=np.concatenate([whole.limits, loop.limits], axis=1),
             limit_slope=np.where(self.is_free[:, None], limit_slope, 0.0),
-            peaks=np.concatenate([whole.peaks, np.full(beyond.shape, np.nan)], axis=1),
+            peaks=np.concatenate([whole.peaks, np.full(loop.limits.shape, np.nan)], axis=1),
             status=whole.status,
             residual=whole.residual,
         )
@@ -201,19 +205,34 @@ class _PartRuns:
         return _Runs(runs, jax.tree.map(split, runs.result.metrics), split(runs.result.status))
 
     def judge(
-        self, goal: Objective, runs: _Runs, baseline: Any, is_differentiated: np.ndarray
+        self,
+        goal: Objective,
+        runs: _Runs,
+        loop: LoopEvaluation,
+        baseline: ScenarioFigures,
+        is_differentiated: np.ndarray,
     ) -> _Judged:
-        """Measure designs against the baseline's metrics, with derivatives of some."""
-        reached = baseline_limits(goal, baseline)
+        """Measure designs against the baseline, with derivatives of some.
+
+        Args:
+            goal: terms and limits.
+            runs: of the designs.
+            loop: theirs.
+            baseline: (S, ...).
+            is_differentiated: designs that need derivatives, (designs,).
+        """
+        reached = baseline_limits(goal, baseline.metrics)
         allowed = [allowed_limits(goal, family, reached) for family in self._families]
-        designs = jax.tree.map(lambda x: x[1:], runs.metrics)
+        designs = ScenarioFigures(jax.tree.map(lambda x: x[1:], runs.metrics), loop.terms)
         judged = judge_with_cotangents(goal, designs, baseline, np.stack(allowed))
         judged = jax.tree.map(np.asarray, judged)
+        slopes = self._slopes(runs.runs, judged.cotangents.metrics, is_differentiated)
+        by_loop = np.einsum("mdst,dstp->dmp", judged.cotangents.loop, loop.term_slopes)
         return _Judged(
             objective=judged.objective,
             limits=judged.limits,
             peaks=judged.peaks,
-            slopes=self._slopes(runs.runs, judged.cotangents, is_differentiated),
+            slopes=slopes + by_loop,
             status=runs.status[1:],
             residual=first_residual(goal, runs.metrics)[1:],
         )
@@ -225,7 +244,7 @@ class _PartRuns:
 
         Args:
             runs: all of a batch.
-            cotangents: from `judge_with_cotangents`.
+            cotangents: by the metrics, from `judge_with_cotangents`.
             needs_gradient: designs that need derivatives, (designs,).
 
         Returns:

@@ -1,69 +1,62 @@
 """Figures of designs from the linearised sampled loop: margins, spillover, residual vibration.
 
 No eigenvalues and no runs: repeated squaring and doubling (`jaxmodel.sampled_loop`), so it works in
-batches on any device. The plant has at least 12 modes, because uncontrolled modes limit the gains.
+batches on any device, with derivatives. Every machine of a tuning has its own loop.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
+from threadpoolctl import threadpool_limits
 
-from jaxmodel.case import Case, Structure
-from jaxmodel.frequency_response import SampledLoopResponse, response_of_loop
-from jaxmodel.kinematics import singularity_distance
-from jaxmodel.linear_residual import linear_residual
+from jaxmodel.case import Structure
 from jaxmodel.loop_figures import MARGINS, PEAKS
 from jaxmodel.parameters import Array
-from jaxmodel.prepare import prepare
-from jaxmodel.robustness import MarginPlace, margin_at, norm_peaks
-from jaxmodel.sampled_loop import LoopMatrices, closed_loop, slowest_decay, spillover
 from studies.engine.plan import padded_rows
-from studies.engine.programs import kept_jit
-from studies.engine.robustness import find_margins, judge_robustness, response_and_modes
-from studies.engine.stability import gain_margin
-from studies.study.cases import as_arrays, build_case, build_structure, case_of
-from studies.study.margin import MARGIN_MODES
-from studies.study.numbers import Numbers, one_study, stack_numbers
-from studies.study.paths import parts_of
-from studies.study.spec import Study
-from studies.tuning.scenarios import nominal
-from studies.tuning.spec import BASELINE, Family, TuneSpec
+from studies.engine.robustness import find_margins
+from studies.errors import StudyError
+from studies.study.cases import in_working_precision
+from studies.study.numbers import Numbers, stack_numbers, study_numbers
+from studies.tuning.loop_figures import (
+    allowed_on,
+    figures_of_cases,
+    judged_structure,
+    machine_figures,
+    relative_margin,
+    term_values,
+    with_decay,
+    with_margin_modes,
+)
+from studies.tuning.loop_programs import (
+    STABLE,
+    figure_slopes,
+    loop_responses,
+    screen_designs,
+    tuned_cases,
+)
+from studies.tuning.scenarios import nominal, tuned_machines
+from studies.tuning.spec import BASELINE, OF_LOOP, Family, TuneSpec
 
-#: Unit of violations of `gain_margin`, and the decay rate that counts as stable if no limit of the
-#: loop is set [1/s].
-STABLE = 10.0
-#: Points of each straight move at which its distance from singularities is evaluated.
-PATH_POINTS = 17
-#: Designs per call; each core takes one call after another.
+#: Designs per call of a screen; each core takes one call after another.
 BATCH = 16
 
 
-class DesignFigures(NamedTuple):
-    """Figures of a design, on the host."""
+class LoopEvaluation(NamedTuple):
+    """Loops of designs on the machines of a tuning, with derivatives; NumPy arrays."""
 
-    gain_margin: float  # largest factor on all gains with every smaller one stable [1]
-    slowest_decay: float  # [1/s]
-    spillover: float  # see `jaxmodel.sampled_loop.spillover` [1]
-    singularity_distance: float  # [rad]
-    # of `jaxmodel.robustness`, nan where nothing limits them
-    disk_margin: float = np.nan  # [1]
-    phase_margin: float = np.nan  # [deg]
-    delay_margin: float = np.nan  # [samples]
-    sensitivity_peak: float = np.nan  # [1]
-    control_effort_peak: float = np.nan  # [1]
-    disturbance_deflection_peak: float = np.nan  # [m/N]
-
-
-def with_margin_modes(study: Study) -> Study:
-    """The study with the number of plant modes used to judge its loop."""
-    return study.change(link__modes=max(MARGIN_MODES, study.link.modes))
+    #: x/(1 + |x|) of x = value/limit - 1 on the worst machine, positive where violated,
+    #: (designs, m)
+    limits: np.ndarray
+    limit_slopes: np.ndarray  # (designs, m, p)
+    terms: np.ndarray  # of the objective, nan where the loop is unstable, (designs, S, t)
+    term_slopes: np.ndarray  # (designs, S, t, p)
 
 
 class LinearFidelity:
@@ -74,62 +67,124 @@ class LinearFidelity:
         Args:
             spec: of the tuning.
             families: of each design, in the order given.
+
+        Raises:
+            StudyError: the baseline has no stable loop to measure designs against.
         """
-        self._spec, self.names, self._links = spec, spec.loop_limits, spec.counted_links
-        self._pose = np.array(nominal(spec, None).motion.waypoints[0])
+        self._spec, self._links = spec, spec.counted_links
+        self.names, self.terms = spec.loop_limits, spec.loop_terms
+        self.machines = tuned_machines(spec)
+        self._compiled: set[Any] = set()
         every = [spec.parts(family) for family in families]
         self._batches = {
-            parts: _batch(spec, families, np.flatnonzero([x == parts for x in every]))
+            parts: self._batch(families, np.flatnonzero([x == parts for x in every]))
             for parts in dict.fromkeys(every)
         }
-        self._own: DesignFigures | None = None
-        self._limits = np.array(
-            [[self._limit(family, name) for name in self.names] for family in families]
-        ).reshape(len(families), len(self.names))
+        baseline = self._baseline(families)
+        #: Of the baseline, (S, t).
+        self.baseline_terms = term_values(self.terms, baseline, self.machines.of_scenario)
+        shape = len(families), self.machines.size, len(self.names)
+        limits = [
+            [allowed_on(x.limits[name], baseline[name]) for name in self.names] for x in families
+        ]
+        self._limits = np.reshape(np.swapaxes(limits, 1, 2) if self.names else limits, shape)
 
-    def _limit(self, family: Family, name: str) -> float:
-        limit = family.limits[name]
-        if limit != BASELINE:
-            return float(limit)
-        self._own = self._own or loop_figures(self._spec, self._spec.study)
-        return float(getattr(self._own, name))
+    def _batch(self, families: list[Family], rows: np.ndarray) -> _Batch:
+        spec, chosen = self._spec, [families[k] for k in rows]
+        parts = spec.parts(chosen[0])
+        structure = judged_structure(
+            spec, nominal(spec, None if parts == spec.parts() else chosen[0])
+        )
+        of_family = {
+            name: self._on_machines(family, structure)
+            for name, family in {family.name: family for family in chosen}.items()
+        }
+        numbers = stack_numbers([of_family[family.name] for family in chosen])
+        numbers = in_working_precision(numbers)
+        return _Batch(rows, structure, numbers)
 
-    def limits(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far designs exceed the limits of their loop, with derivatives.
+    def _on_machines(self, family: Family, structure: Structure) -> Numbers:
+        study = with_margin_modes(family.study(self._spec.study))
+        numbers = study_numbers(study, structure, self.machines.columns)
+        whole: Numbers = jax.tree.map(
+            lambda x: np.broadcast_to(x, (self.machines.size, *x.shape[1:])), numbers
+        )
+        return whole
+
+    def _baseline(self, families: list[Family]) -> dict[str, np.ndarray]:
+        """Figures of the baseline that designs are measured against, nan: none is, (machines,)."""
+        relative = {
+            name: f"tune.limits.{name} = {BASELINE!r}"
+            for name in self.names
+            if any(family.limits[name] == BASELINE for family in families)
+        } | {name: f"tune.objective.{name}" for name in self.terms}
+        is_stable_needed = any(name in OF_LOOP for name in relative)
+        names = with_decay(tuple(relative)) if is_stable_needed else tuple(relative)
+        found = dict.fromkeys(self.names, np.full(self.machines.size, np.nan))
+        if names:
+            found |= machine_figures(self._spec, self._spec.study, self.machines.columns, names)
+        for name, path in relative.items():
+            if name in OF_LOOP:
+                _check_stable(path, found["slowest_decay"])
+            bad = ~(np.isfinite(found[name]) & (found[name] > 0))
+            if bad.any():
+                k = int(np.argmax(bad))
+                raise StudyError(
+                    f"{path}: the baseline has {found[name][k]:.4g}{_on_machine(k, bad)}; allowed: "
+                    "a baseline with a finite value > 0 on every machine of tune.scenarios"
+                )
+        return found
+
+    def evaluate(self, values: np.ndarray) -> LoopEvaluation:
+        """Limits and terms of the objective of the loop, with derivatives.
 
         Args:
             values: one design for each family of the constructor, (designs, p).
-
-        Returns:
-            (x/(1 + |x|) of x = value/limit - 1, positive where violated, (designs, m), its
-            derivatives, (designs, m, p)).
         """
-        if not self.names:
-            return np.zeros((len(values), 0)), np.zeros((len(values), 0, values.shape[1]))
-        excess = np.zeros(self._limits.shape)
-        slopes = np.zeros((*excess.shape, values.shape[1]))
-        for batch in self._batches.values():
-            # drop what the matrices do not depend on, to avoid a compilation
-            structure = batch.structure._replace(n_steps=1, substeps=1)
-            place, mine = self._spec.free.place, values[batch.rows]
-            margins, places = tuple(name for name in self.names if name in MARGINS), {}
+        designs, p = values.shape
+        count = len(self.names) + len(self.terms)
+        figures = np.zeros((designs, self.machines.size, count))
+        slopes = np.zeros((*figures.shape, p))
+        for batch in self._batches.values() if count else ():
+            found = self._differentiate(batch, values[batch.rows])
+            figures[batch.rows], slopes[batch.rows] = found
+        excess, terms = np.split(figures, [len(self.names)], axis=2)
+        by_limit, by_term = np.split(slopes, [len(self.names)], axis=2)
+        worst = excess.argmax(axis=1, keepdims=True)  # of the machines; nan first
+        return LoopEvaluation(
+            limits=np.take_along_axis(excess, worst, axis=1)[:, 0],
+            limit_slopes=np.take_along_axis(by_limit, worst[..., None], axis=1)[:, 0],
+            terms=terms[:, self.machines.of_scenario],
+            term_slopes=by_term[:, self.machines.of_scenario],
+        )
+
+    def _differentiate(self, batch: _Batch, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Figures of some designs on every machine, (designs, machines, m + t), and slopes."""
+        designs, machines = len(values), self.machines.size
+        place = self._spec.free.place
+        margins = tuple(x for x in MARGINS if x in (*self.names, *self.terms))
+        limits = self._limits[batch.rows].reshape(designs * machines, -1)
+        numbers = batch.each_machine()
+
+        def differentiate(lanes: np.ndarray) -> tuple[Array, Array]:
+            own = jax.tree.map(lambda x: x[lanes], numbers)
+            mine, places = values[lanes // machines], {}
             if margins:
-                response, modes = _responses(structure, place, batch.numbers, self._pose, mine)
+                response, modes = loop_responses(batch.structure, place, own, mine)
                 places = find_margins(response, modes, margins, is_fine=True)
-            excess[batch.rows], slopes[batch.rows] = _limit_slopes(
-                structure,
-                self.names,
-                place,
-                batch.numbers,
-                self._pose,
-                self._limits[batch.rows],
-                mine,
-                places,
+            return figure_slopes(
+                batch.structure, self.names, self.terms, place, own, limits[lanes], mine, places
             )
-        return excess, slopes
+
+        cores, lanes = os.cpu_count() or 1, designs * machines
+        found = self._in_parts(batch, lanes, -(-lanes // cores), differentiate)
+        figures, slopes = (x.reshape(designs, machines, *x.shape[1:]) for x in found)
+        return figures, slopes
 
     def screen(self, position: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A quick evaluation of designs of one family.
+        """A quick evaluation of designs of one family, on the nominal machine alone.
+
+        Margins and norms by frequency response are left out, which take longer than all others.
 
         Args:
             position: index of a design of that family among those of the constructor.
@@ -139,34 +194,107 @@ class LinearFidelity:
             (largest excess over the limits of the loop, at least that of a stable one, inf where
             none is found, (n,); linear residual vibration [m], (n,)).
         """
-        batch = next(x for x in self._batches.values() if position in x.rows)
+        batch = self._batch_of(position)
         if batch.structure.feedback != "sampled":
             return np.zeros(len(values)), np.zeros(len(values))
-        # margins by frequency response take longer than all others: their designs must be stable
         quick = [k for k, name in enumerate(self.names) if name not in (*MARGINS, *PEAKS)]
         names = tuple(self.names[k] for k in quick) or ("slowest_decay",)
-        limits = self._limits[position, quick] if quick else np.array([STABLE])
         evaluate = partial(
-            _screen_batch,
+            screen_designs,
             batch.structure,
             names,
             self._spec.free.place,
-            jax.tree.map(lambda x: x[np.searchsorted(batch.rows, position)], batch.numbers),
-            self._pose,
-            limits,
+            jax.tree.map(lambda x: x[0], batch.of_design(position)),
+            self._limits[position, 0, quick] if quick else np.array([STABLE]),
             self._links,
         )
-        count = len(values)
-        rows = padded_rows(count, BATCH)
-        parts = np.split(values[rows], len(rows) // BATCH)
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            results = list(pool.map(lambda part: jax.tree.map(np.asarray, evaluate(part)), parts))
-        excess, residual = (np.concatenate(x)[:count] for x in zip(*results, strict=True))
+        excess, residual = self._in_parts(
+            batch, len(values), BATCH, lambda rows: evaluate(values[rows])
+        )
         worst = excess.max(axis=1)
         return (
             np.where(np.isfinite(worst), worst, np.inf),
             np.where(np.isfinite(residual), residual, np.inf),
         )
+
+    def plain_terms(self, position: int, values: np.ndarray) -> np.ndarray:
+        """Terms of the objective of designs (n, p) of one family, see `screen`; (n, S, t)."""
+        if not self.terms:
+            return np.zeros((len(values), len(self.machines.of_scenario), 0))
+        figures = self._plain(position, values, with_decay(self.terms))
+        terms = [
+            term_values(
+                self.terms, dict(zip(figures, each, strict=True)), self.machines.of_scenario
+            )
+            for each in zip(*figures.values(), strict=True)
+        ]
+        return np.stack(terms)
+
+    def beyond(self, position: int, values: np.ndarray) -> np.ndarray:
+        """How far designs (n, p) of one family exceed the limits of the loop on any machine, (n,).
+
+        As shares of the limits, -inf without limits.
+        """
+        figures = self._plain(position, values, self.names)
+        beyond = np.full((len(values), len(self.names)), -np.inf)
+        for k, name in enumerate(self.names):
+            allowed = self._limits[position, :, k]
+            beyond[:, k] = [-relative_margin(name, each, allowed) for each in figures[name]]
+        return beyond.max(axis=1, initial=-np.inf)
+
+    def _plain(
+        self, position: int, values: np.ndarray, names: tuple[str, ...]
+    ) -> dict[str, np.ndarray]:
+        """Figures of designs of one family on every machine, (n, machines)."""
+        batch, shape = self._batch_of(position), (len(values), self.machines.size)
+        lanes = np.arange(shape[0] * shape[1])
+        numbers = jax.tree.map(lambda x: x[lanes % shape[1]], batch.of_design(position))
+        cases = tuned_cases(
+            batch.structure, self._spec.free.place, numbers, values[lanes // shape[1]]
+        )
+        cases = jax.tree.map(np.asarray, cases)
+        figures = figures_of_cases(batch.structure, cases, names, len(lanes))
+        return {name: x.reshape(shape) for name, x in figures.items()}
+
+    def _in_parts(
+        self, batch: _Batch, count: int, size: int, evaluate: Callable[[np.ndarray], Any]
+    ) -> tuple[np.ndarray, ...]:
+        """Evaluate rows in parts of equal size; each core takes one part after another.
+
+        Args:
+            batch: whose designs they are.
+            count: of rows.
+            size: of a part; the last row fills the last one up.
+            evaluate: function of rows (size,), a tuple of arrays with these first.
+        """
+        rows = padded_rows(count, size)
+        parts = np.split(rows, len(rows) // size)
+        # two threads would compile the same program twice
+        program = evaluate.__qualname__, batch.structure, size
+        cores = os.cpu_count() if program in self._compiled else 1
+        self._compiled.add(program)
+        with threadpool_limits(1, "blas"), ThreadPoolExecutor(cores) as pool:
+            results = list(pool.map(lambda part: jax.tree.map(np.asarray, evaluate(part)), parts))
+        return tuple(np.concatenate(x)[:count] for x in zip(*results, strict=True))
+
+    def _batch_of(self, position: int) -> _Batch:
+        return next(x for x in self._batches.values() if position in x.rows)
+
+
+def _check_stable(path: str, decay: np.ndarray) -> None:
+    is_bad = ~(decay > 0)
+    if is_bad.any():
+        k = int(np.argmax(is_bad))
+        raise StudyError(
+            f"{path}: the loop of the baseline is unstable{_on_machine(k, is_bad)}, its slowest "
+            f"decay {decay[k]:.4g} 1/s; allowed: > 0 on every machine of tune.scenarios"
+        )
+
+
+def _on_machine(k: int, every: np.ndarray) -> str:
+    if len(every) == 1:
+        return ""
+    return " on machine " + (f"{k + 1}" if k else "1, the nominal one") + f" of {len(every)}"
 
 
 class _Batch(NamedTuple):
@@ -174,170 +302,17 @@ class _Batch(NamedTuple):
 
     rows: np.ndarray  # places among all designs, rising
     structure: Structure
-    numbers: Numbers
+    numbers: Numbers  # leaves (designs, machines, ...)
 
+    def of_design(self, position: int) -> Numbers:
+        """Those of one design by its place among all, leaves (machines, ...)."""
+        row = int(np.searchsorted(self.rows, position))
+        numbers: Numbers = jax.tree.map(lambda x: x[row], self.numbers)
+        return numbers
 
-def _batch(spec: TuneSpec, families: list[Family], rows: np.ndarray) -> _Batch:
-    chosen = [families[k] for k in rows]
-    parts = spec.parts(chosen[0])
-    first = None if parts == spec.parts() else chosen[0]
-    structure = _judged_structure(spec, nominal(spec, first))
-    of_family = {
-        name: one_study(with_margin_modes(nominal(spec, family)), structure)
-        for name, family in {family.name: family for family in chosen}.items()
-    }
-    numbers = as_arrays(stack_numbers([of_family[family.name] for family in chosen]))
-    return _Batch(rows, structure, numbers)
-
-
-def _judged_structure(spec: TuneSpec, study: Study) -> Structure:
-    """Program of the linearised loop of a study's law and drive."""
-    return build_structure(with_margin_modes(study))._replace(
-        n_frequencies=1,
-        has_noise=False,
-        metrics=(),
-        has_position_gain=spec.has_position_gain(parts_of(study)),
-    )
-
-
-def _excess(
-    structure: Structure,
-    names: tuple[Any, ...],
-    case: Case,
-    pose: Array,
-    matrices: LoopMatrices,
-    limits: Array,
-    places: dict[str, MarginPlace],
-) -> Array:
-    """x/(1 + |x|) for each limit, (m,): decay rates reach hundreds of their limit on both sides.
-
-    x is value/limit - 1, or -decay/STABLE of the loop with all gains times the required margin.
-    Figures of `jaxmodel.robustness` are those of stable loops: others count as 1 - decay/STABLE,
-    which is what margins reach at the edge.
-    """
-    period, excesses = case.electronics.period, []
-    wanted = tuple(name for name in names if name in (*MARGINS, *PEAKS))
-    if wanted:
-        response = response_of_loop(structure, case, prepare(structure, case).loop, pose)
-        figures = {name: margin_at(response, name, place) for name, place in places.items()}
-        peaks = tuple(name for name in names if name in PEAKS)
-        figures |= norm_peaks(response, peaks) if peaks else {}
-        own_decay = slowest_decay(matrices.open + matrices.feedback, period)
-    for k, name in enumerate(names):
-        if name in wanted:
-            share = figures[name] / limits[k]
-            within = 1 - share if name in MARGINS else share - 1
-            x = jnp.where(own_decay > 0, within, 1 - own_decay / STABLE)
-        elif name == "spillover":
-            x = spillover(structure, case, matrices) / limits[k] - 1
-        elif name == "singularity_distance":
-            x = 1 - _singularity_distance(structure, case) / limits[k]
-        else:
-            factor = limits[k] if name == "gain_margin" else 1.0
-            decay = slowest_decay(matrices.open + factor * matrices.feedback, period)
-            x = -decay / STABLE if name == "gain_margin" else 1 - decay / limits[k]
-        excesses.append(x / (1 + jnp.abs(x)))
-    return jnp.stack(excesses)
-
-
-def _singularity_distance(structure: Structure, case: Case) -> Array:
-    """Of the straight lines between way-points [rad], ()."""
-    points, share = case.path.waypoints, jnp.linspace(0.0, 1.0, PATH_POINTS)[:, None, None]
-    line = points[:-1] + share * (points[1:] - points[:-1])
-    pose = jnp.concatenate([points, jnp.reshape(line, (-1, 3))])
-    return singularity_distance(prepare(structure, case).loop.plant, pose)
-
-
-# compiled without optimisation: it takes a fraction of the time
-@kept_jit(static_argnums=(0, 1), compiler_options={"xla_backend_optimization_level": 0})
-def _responses(
-    structure: Structure, place: Any, numbers: Numbers, pose: Array, values: Array
-) -> tuple[SampledLoopResponse, tuple[Array, Array]]:
-    """What a search of margins reads of each design."""
-
-    def one(x: Array, numbers: Numbers) -> tuple[SampledLoopResponse, tuple[Array, Array]]:
-        return response_and_modes(structure, case_of(structure, place(numbers, x)), pose)
-
-    return jax.vmap(one)(values, numbers)
-
-
-@kept_jit(static_argnums=(0, 1, 2))
-def _limit_slopes(
-    structure: Structure,
-    names: tuple[Any, ...],
-    place: Any,
-    numbers: Numbers,
-    pose: Array,
-    limits: Array,
-    values: Array,
-    places: dict[str, MarginPlace],
-) -> tuple[Array, Array]:
-    def figures(
-        x: Array, numbers: Numbers, limit: Array, places: dict[str, MarginPlace]
-    ) -> tuple[Array, Array]:
-        case = case_of(structure, place(numbers, x))
-        matrices = closed_loop(structure, case, pose)
-        excess = _excess(structure, names, case, pose, matrices, limit, places)
-        return excess, excess
-
-    def one(design: tuple[Any, ...]) -> tuple[Array, Array]:
-        slope, excess = jax.jacrev(figures, has_aux=True)(*design)  # the figures come with it
-        return excess, slope
-
-    return jax.lax.map(one, (values, numbers, limits, places))
-
-
-@kept_jit(static_argnums=(0, 1, 2, 6))
-def _screen_batch(
-    structure: Structure,
-    names: tuple[Any, ...],
-    place: Any,
-    numbers: Numbers,
-    pose: Array,
-    limits: Array,
-    links: tuple[int, ...],
-    values: Array,
-) -> tuple[Array, Array]:
-    def one(x: Array) -> tuple[Array, Array]:
-        case = case_of(structure, place(numbers, x))
-        matrices = closed_loop(structure, case, pose)
-        rms = linear_residual(structure, case, matrices)
-        excess = _excess(structure, names, case, pose, matrices, limits, {})
-        return excess, jnp.sqrt(jnp.mean(rms[np.array(links)] ** 2))
-
-    return jax.lax.map(one, values)
-
-
-_closed_loop = kept_jit(static_argnums=0)(closed_loop)
-_spillover = kept_jit(static_argnums=0)(spillover)
-_distance = kept_jit(static_argnums=0)(_singularity_distance)
-
-
-def loop_figures(spec: TuneSpec, study: Study) -> DesignFigures:
-    """Figures of a design's loop on a plant of 12 modes or more.
-
-    Args:
-        spec: of the tuning; its designs of one law and drive share a program.
-        study: one of them, with sampled feedback.
-    """
-    larger = with_margin_modes(study)
-    structure, case = _judged_structure(spec, study), as_arrays(build_case(larger))
-    plain = structure._replace(n_steps=1, substeps=1)
-    matrices = _closed_loop(plain, case, np.array(larger.motion.waypoints[0]))
-    open_loop, feedback = np.asarray(matrices.open), np.asarray(matrices.feedback)
-    period = float(case.electronics.period)
-
-    def poles(factor: float) -> np.ndarray:
-        return np.linalg.eigvals(open_loop + factor * feedback)
-
-    margin = gain_margin(poles)
-    limited = tuple(name for name in (*MARGINS, *PEAKS) if name in spec.loop_limits)
-    one = jax.tree.map(lambda x: np.asarray(x)[None], case)
-    robust = judge_robustness(plain, one, limited, np.array([margin]))
-    return DesignFigures(
-        margin,
-        float(-np.log(np.abs(poles(1.0)).max()) / period),
-        float(_spillover(plain, case, matrices)),
-        float(_distance(plain, case)),
-        **{name: float(value[0]) for name, value in robust.items()},
-    )
+    def each_machine(self) -> Numbers:
+        """Machine by machine within each design, leaves (designs x machines, ...)."""
+        numbers: Numbers = jax.tree.map(
+            lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), self.numbers
+        )
+        return numbers

@@ -1,4 +1,4 @@
-"""Rating of a design: objective and limits from the metrics of its runs."""
+"""Rating of a design: objective and limits from its runs and its loops."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from jaxmodel.metrics import Metrics
 from jaxmodel.parameters import Array
 from studies.study.entries import parse_entries
-from studies.tuning.spec import BASELINE, Family, TuneSpec
+from studies.tuning.spec import BASELINE, LOWER, Family, TuneSpec
 
 #: Metrics that a report always shows.
 SHOWN = ("residual_rms", "settling_time", "peak_voltage")
@@ -21,7 +21,8 @@ SHOWN = ("residual_rms", "settling_time", "peak_voltage")
 class Objective(NamedTuple):
     """What a tuning minimises, and the metrics that it limits; hashable."""
 
-    terms: tuple[tuple[str, float], ...]  # metric and weight, sum 1
+    terms: tuple[tuple[str, float], ...]  # metric and weight
+    loop: tuple[tuple[str, float], ...]  # figure of the loop and weight; all weights sum to 1
     limits: tuple[str, ...]  # metrics with a limit
     tail: float  # share of worst scenarios that count
     links: tuple[int, ...]  # those that count if a name gives no link, from 0
@@ -42,6 +43,13 @@ class Objective(NamedTuple):
         return _fields(self.shown)
 
 
+class ScenarioFigures(NamedTuple):
+    """What the objective of a design is made of, in each scenario."""
+
+    metrics: Metrics  # (S, ...)
+    loop: Array  # terms of the loop in the order of `Objective.loop`, nan: unstable, (S, t)
+
+
 def _fields(names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(sorted({parse_entries(name).metric for name in names}))
 
@@ -49,9 +57,14 @@ def _fields(names: tuple[str, ...]) -> tuple[str, ...]:
 def objective_of(spec: TuneSpec) -> Objective:
     """Objective of a tuning."""
     total = sum(map(float, spec.tune.objective.values()))
-    weights = tuple((name, float(weight) / total) for name, weight in spec.tune.objective.items())
-    tail = float(spec.tune.scenarios.tail)
-    return Objective(weights, spec.metric_limits, tail, spec.counted_links)
+    weights = {name: float(weight) / total for name, weight in spec.tune.objective.items()}
+    return Objective(
+        terms=tuple((name, weights[name]) for name in spec.metric_terms),
+        loop=tuple((name, weights[name]) for name in spec.loop_terms),
+        limits=spec.metric_limits,
+        tail=float(spec.tune.scenarios.tail),
+        links=spec.counted_links,
+    )
 
 
 def entries(goal: Objective, metrics: Metrics, name: str) -> Array:
@@ -78,35 +91,44 @@ def tail_weights(count: int, tail: float) -> np.ndarray:
     return np.clip(most - np.arange(count), 0.0, 1.0) / most
 
 
-def objectives(goal: Objective, metrics: Metrics, baseline: Metrics) -> Array:
+def objectives(goal: Objective, design: ScenarioFigures, baseline: ScenarioFigures) -> Array:
     """Objective in each scenario, (S,); the baseline's is 1.
+
+    Sum of weight times the share of the baseline's value: of the size of a metric and of a figure
+    of the loop, the other way round of figures of which more is better.
 
     Args:
         goal: weights.
-        metrics: of the design, (S, ...).
-        baseline: of the baseline in the same scenarios, (S, ...).
+        design: (S, ...).
+        baseline: in the same scenarios, (S, ...).
     """
-    shares = [weight * size(goal, metrics, x) / size(goal, baseline, x) for x, weight in goal.terms]
+    shares = [
+        weight * size(goal, design.metrics, x) / size(goal, baseline.metrics, x)
+        for x, weight in goal.terms
+    ]
+    for k, (name, weight) in enumerate(goal.loop):
+        share = design.loop[:, k] / baseline.loop[:, k]
+        shares.append(weight * (1 / share if name in LOWER else share))
     return jnp.sum(jnp.stack(shares), axis=0)
 
 
 def judge_design(
-    goal: Objective, metrics: Metrics, baseline: Metrics, allowed: Array
+    goal: Objective, design: ScenarioFigures, baseline: ScenarioFigures, allowed: Array
 ) -> tuple[Array, Array, Array]:
     """Judge a design.
 
     Args:
         goal: terms and limits.
-        metrics: (S, ...).
-        baseline: of the baseline, (S, ...).
+        design: (S, ...).
+        baseline: (S, ...).
         allowed: limits in each scenario, (S, m).
 
     Returns:
         objective (), largest value over limit - 1 (m,), largest values (m,).
     """
-    each = objectives(goal, metrics, baseline)
+    each = objectives(goal, design, baseline)
     weights = tail_weights(each.shape[0], goal.tail)
-    values = [largest(goal, metrics, name) for name in goal.limits]
+    values = [largest(goal, design.metrics, name) for name in goal.limits]
     peaks = jnp.stack(values, axis=1) if values else jnp.zeros((each.shape[0], 0))
     excess = jnp.max(peaks / allowed - 1, axis=0)
     return jnp.sum(-jnp.sort(-each) * weights), excess, jnp.max(peaks, axis=0)
@@ -114,10 +136,10 @@ def judge_design(
 
 @partial(jax.jit, static_argnums=0)
 def judge_designs(
-    goal: Objective, metrics: Metrics, baseline: Metrics, allowed: Array
+    goal: Objective, designs: ScenarioFigures, baseline: ScenarioFigures, allowed: Array
 ) -> tuple[Array, Array, Array]:
-    """`judge_design` for designs under the same limits, metrics (designs, S, ...)."""
-    return jax.vmap(lambda x: judge_design(goal, x, baseline, allowed))(metrics)
+    """`judge_design` for designs under the same limits, leaves (designs, S, ...)."""
+    return jax.vmap(lambda x: judge_design(goal, x, baseline, allowed))(designs)
 
 
 class JudgedDesigns(NamedTuple):
@@ -126,33 +148,33 @@ class JudgedDesigns(NamedTuple):
     objective: Array  # (designs,)
     limits: Array  # largest value over limit - 1, (designs, m)
     peaks: Array  # largest values, (designs, m)
-    cotangents: Metrics  # of objective and limits by the metrics, (1 + m, designs, S, ...)
+    cotangents: ScenarioFigures  # of objective and limits, (1 + m, designs, S, ...)
 
 
 @partial(jax.jit, static_argnums=0)
 def judge_with_cotangents(
-    goal: Objective, metrics: Metrics, baseline: Metrics, allowed: Array
+    goal: Objective, designs: ScenarioFigures, baseline: ScenarioFigures, allowed: Array
 ) -> JudgedDesigns:
-    """Judge designs and differentiate by the metrics.
+    """Judge designs and differentiate by what was measured.
 
     Args:
         goal: terms and limits.
-        metrics: (designs, S, ...).
-        baseline: of the baseline, (S, ...).
+        designs: (designs, S, ...).
+        baseline: (S, ...).
         allowed: limits in each scenario, (designs, S, m).
     """
 
-    def one(metrics: Metrics, allowed: Array) -> JudgedDesigns:
-        def figures(x: Metrics) -> tuple[Array, Array]:
+    def one(design: ScenarioFigures, allowed: Array) -> JudgedDesigns:
+        def figures(x: ScenarioFigures) -> tuple[Array, Array]:
             objective, limits, peaks = judge_design(goal, x, baseline, allowed)
             return jnp.concatenate([objective[None], limits]), peaks
 
-        values, back, peaks = jax.vjp(figures, metrics, has_aux=True)
+        values, back, peaks = jax.vjp(figures, design, has_aux=True)
         (cotangents,) = jax.vmap(back)(jnp.eye(values.size, dtype=values.dtype))
         return JudgedDesigns(values[0], values[1:], peaks, cotangents)
 
     axes: Any = JudgedDesigns._make((0, 0, 0, 1))
-    return jax.vmap(one, out_axes=axes)(metrics, allowed)
+    return jax.vmap(one, out_axes=axes)(designs, allowed)
 
 
 def baseline_limits(goal: Objective, baseline: Metrics) -> np.ndarray:

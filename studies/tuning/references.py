@@ -21,11 +21,25 @@ from studies.study.entries import parse_entries
 from studies.study.resolution import is_deflection, least_step, resolution_text
 from studies.study.spec import Study
 from studies.tuning.check import JudgedDesign, PartRuns, PlainRuns, judge
-from studies.tuning.linear_fidelity import DesignFigures, loop_figures
-from studies.tuning.objective import allowed_limits, baseline_limits, judge_designs, objective_of
+from studies.tuning.loop_figures import (
+    DesignFigures,
+    allowed_on,
+    machine_figures,
+    relative_margin,
+    term_values,
+    unit_text,
+    with_decay,
+)
+from studies.tuning.objective import (
+    ScenarioFigures,
+    allowed_limits,
+    baseline_limits,
+    judge_designs,
+    objective_of,
+)
 from studies.tuning.optimise import KEPT, excess
-from studies.tuning.scenarios import fresh_machines, lane_columns, scenario_columns
-from studies.tuning.spec import BASELINE, LOWER, Family, TuneSpec
+from studies.tuning.scenarios import fresh_machines, lane_columns, scenario_columns, tuned_machines
+from studies.tuning.spec import BASELINE, Family, TuneSpec
 
 FIELD = "control.gain_factor"
 #: Values that are scanned: this many between these multiples of the baseline's, and that itself.
@@ -40,7 +54,8 @@ class GainScan(NamedTuple):
     """The gain factor alone, on the scenarios of the tuning."""
 
     gain_factor: np.ndarray  # ascending [1], (n,)
-    objective: np.ndarray  # nan if a run did not finish, (n,)
+    #: nan if a run did not finish or a loop in the objective is unstable, (n,)
+    objective: np.ndarray
     excess: np.ndarray  # largest violation of the limits on metrics, 0 where kept, (n,)
     best: int  # the least objective that keeps all limits; -1 if none does
 
@@ -88,7 +103,10 @@ def compare(
     count = len(designs) - 1
     compared = dict(zip(others, judged[count:], strict=True))
     if WITHOUT in compared:
-        compared[WITHOUT] = compared[WITHOUT]._replace(loop=None, poles=None)
+        nothing: dict[str, np.ndarray] = {}
+        compared[WITHOUT] = compared[WITHOUT]._replace(
+            loop=None, poles=None, tuned_loop=nothing, fresh_loop=nothing
+        )
     has_adc = is_on and spec.study.control.feedback == "sampled"
     step = frame_of(*check_run(spec.study)).adc_step if has_adc else None
     references = References(compared.get(WITHOUT), scan, compared.get(ALONE), step)
@@ -145,9 +163,25 @@ def _evaluate(spec: TuneSpec, runs: PlainRuns, values: np.ndarray) -> tuple[np.n
     metrics = jax.tree.map(split, result.metrics)
     baseline, others = (jax.tree.map(lambda x, k=k: x[k], metrics) for k in (0, slice(1, None)))
     allowed = allowed_limits(goal, designs[0], baseline_limits(goal, baseline))
-    objective, limits, _ = map(np.asarray, judge_designs(goal, others, baseline, allowed))
+    terms = _terms(spec, values)
+    measured = ScenarioFigures(others, terms[1:]), ScenarioFigures(baseline, terms[0])
+    objective, limits, _ = map(np.asarray, judge_designs(goal, *measured, allowed))
     is_whole = np.isin(split(result.status)[1:], status.FINISHED).all(axis=1)
     return np.where(is_whole, objective, np.nan), excess(limits)
+
+
+def _terms(spec: TuneSpec, values: np.ndarray) -> np.ndarray:
+    """Terms of the objective of the loop, of the baseline and gain factors (n,); (1 + n, S, t)."""
+    machines, names = tuned_machines(spec), with_decay(spec.loop_terms)
+    if not names:
+        return np.zeros((1 + len(values), len(machines.of_scenario), 0))
+    factors = np.append(spec.study.control.gain_factor, values)
+    columns = {name: np.concatenate([x] * len(factors)) for name, x in machines.columns.items()}
+    columns[FIELD] = np.repeat(factors, machines.size)
+    figures = machine_figures(spec, spec.study, columns, names)
+    parts = {name: figures[name].reshape(len(factors), -1) for name in names}
+    designs = ({name: x[k] for name, x in parts.items()} for k in range(len(factors)))
+    return np.stack([term_values(spec.loop_terms, x, machines.of_scenario) for x in designs])
 
 
 def gain_study(spec: TuneSpec, value: float) -> Study:
@@ -156,26 +190,21 @@ def gain_study(spec: TuneSpec, value: float) -> Study:
 
 
 def _keeps_loop(spec: TuneSpec, value: float) -> bool:
-    """Whether a gain factor keeps the limits of the linearised loop."""
-    if not spec.loop_limits or spec.study.control.feedback != "sampled":
+    """Whether a gain factor keeps the limits of the linearised loop on all machines."""
+    limits = {name: spec.tune.limits[name] for name in spec.loop_limits}
+    if not limits or spec.study.control.feedback != "sampled":
         return True
-    figures, baseline = loop_figures(spec, gain_study(spec, value)), None
-    for name in spec.loop_limits:
-        limit = spec.tune.limits[name]
-        if limit == BASELINE:
-            baseline = baseline or loop_figures(spec, spec.study)
-        left = relative_margin(
-            name, figures, getattr(baseline, name) if limit == BASELINE else float(limit)
-        )
-        if left < -KEPT:
-            return False
-    return True
-
-
-def relative_margin(name: str, figures: DesignFigures, allowed: float) -> float:
-    """How far a figure of the loop is from its limit, as a share of it; negative: violated."""
-    share: float = getattr(figures, name) / allowed - 1
-    return share if name in LOWER else -share
+    columns = tuned_machines(spec).columns
+    figures = machine_figures(spec, gain_study(spec, value), columns, tuple(limits))
+    baseline = dict.fromkeys(limits, np.full(len(columns["run.seed"]), np.nan))
+    relative = tuple(name for name, limit in limits.items() if limit == BASELINE)
+    if relative:
+        baseline |= machine_figures(spec, spec.study, columns, relative)
+    left = [
+        relative_margin(name, figures[name], allowed_on(limit, baseline[name]))
+        for name, limit in limits.items()
+    ]
+    return bool(np.min(left) >= -KEPT)
 
 
 def reference_lines(spec: TuneSpec, baseline: JudgedDesign, references: References) -> list[str]:
@@ -195,10 +224,12 @@ def reference_lines(spec: TuneSpec, baseline: JudgedDesign, references: Referenc
                 f"{name}, {value:.4g} instead of {spec.study.control.gain_factor:.4g} (the best "
                 f"of {len(references.scan.gain_factor)} values on the scenarios of the tuning)"
             )
-        terms = ", ".join(_term(x, design, baseline) for x in spec.tune.objective)
+        terms = [_term(x, design, baseline) for x in spec.metric_terms]
+        if design.loop is not None and baseline.loop is not None:
+            terms += [_loop_term(x, design.loop, baseline.loop) for x in spec.loop_terms]
+        own = f"; on its own machine {', '.join(terms)}" if terms else ""
         lines.append(
-            f"{which}: {design.objective.mean():.4f} of the baseline's objective on {machines}; "
-            f"on its own machine {terms}"
+            f"{which}: {design.objective.mean():.4f} of the baseline's objective on {machines}{own}"
         )
     if references.scan is not None and references.scan.best < 0:
         values = references.scan.gain_factor
@@ -216,6 +247,13 @@ def _term(metric: str, design: JudgedDesign, baseline: JudgedDesign) -> str:
     return f"{metric} {after} instead of {before} {readable(unit)[1]}"
 
 
+def _loop_term(name: str, design: DesignFigures, baseline: DesignFigures) -> str:
+    """A term of the objective that is a figure of the loop, of a design and of the baseline."""
+    unit = unit_text(name)
+    before, after = (f"{getattr(x, name):.4g}" for x in (baseline, design))
+    return f"{name} {after} instead of {before}" + (f" {unit}" if unit != "1" else "")
+
+
 def resolution_lines(
     spec: TuneSpec, designs: list[JudgedDesign], adc_step: np.ndarray | None
 ) -> list[str]:
@@ -229,7 +267,7 @@ def resolution_lines(
     if adc_step is None:
         return []
     lines = []
-    for name in filter(is_deflection, spec.tune.objective):
+    for name in filter(is_deflection, spec.metric_terms):
         step = least_step(name, adc_step, spec.counted_links)
         values = np.array([design.own_run.metrics[name] for design in designs])
         lines.append(resolution_text(name, values[np.isfinite(values)], step, "design"))

@@ -10,6 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from jaxmodel import status
+from jaxmodel.loop_figures import MARGINS, PEAKS
 from jaxmodel.metrics import METRICS
 from studies.engine.poles import HEADER, difference, pole_rows
 from studies.publish import shown
@@ -22,12 +23,19 @@ from studies.study.template import study_template, toml_text
 from studies.tuning.audit import ALLOWED, MEANING, Disagreement
 from studies.tuning.check import JudgedDesign, RandomSearch, patch_centers
 from studies.tuning.free import PLACEMENT
-from studies.tuning.linear_fidelity import DesignFigures
+from studies.tuning.loop_figures import (
+    LOOP_UNITS,
+    DesignFigures,
+    allowed_on,
+    relative_margin,
+    unit_text,
+    worst_value,
+)
 from studies.tuning.objective import SHOWN
 from studies.tuning.optimise import GAIN, KEPT, PATIENCE, Progress, excess
-from studies.tuning.references import References, reference_lines, relative_margin, resolution_lines
+from studies.tuning.references import References, reference_lines, resolution_lines
 from studies.tuning.scenarios import fresh_machines, move_label
-from studies.tuning.spec import BASELINE, LOOP_LIMITS, LOWER, Family, TuneSpec, label
+from studies.tuning.spec import LOOP_LIMITS, LOWER, Family, TuneSpec, label
 
 #: A limit closer than this share counts as active.
 NEAR = 0.02
@@ -83,7 +91,7 @@ def report(
         ended=ended(spec, at),
         n_frozen=int(at.is_frozen.sum()),
         n_outside=n_outside(at),
-        names_links=all(parse_entries(name).names_a_link for name in spec.tune.objective),
+        names_links=all(parse_entries(name).names_a_link for name in spec.metric_terms),
         lower=LOWER,
         best=_best(spec, findings),
         references=reference_lines(spec, findings.baseline, findings.references),
@@ -92,6 +100,8 @@ def report(
         folder=f"{folder}/" if folder else "",
         heads=[headed(x, METRICS[parse_entries(x).metric].unit) for x in names],
         own=_own_machine(spec, findings, names),
+        loop_heads=[_loop_head(x) for x in _of_response(spec)],
+        fresh_loop_heads=[_loop_head(x) for x in _judged_fresh(spec, findings)],
         n_modes=max(MARGIN_MODES, spec.study.link.modes),
         fresh=_fresh(spec, findings, names),
         metrics=names,
@@ -144,10 +154,10 @@ def _best(spec: TuneSpec, findings: TuneFindings) -> dict[str, Any]:
     best, baseline, family = findings.judged[k], findings.baseline, spec.families[k]
     gains = [
         _metric_gain(metric, best, baseline)
-        for metric in dict.fromkeys((*spec.tune.objective, *SHOWN))
+        for metric in dict.fromkeys((*spec.metric_terms, *SHOWN))
     ]
     if best.loop is not None and baseline.loop is not None:
-        gains += _loop_gains(best.loop, baseline.loop)
+        gains += _loop_gains(spec, best.loop, baseline.loop)
     return {
         "family": family.name,
         "file": file_name(spec, family),
@@ -188,16 +198,43 @@ def _gain(figure: str, change: str, after: str, before: str, is_worse: bool) -> 
     }
 
 
-def _loop_gains(design: DesignFigures, baseline: DesignFigures) -> list[dict[str, Any]]:
-    """Figures of the linearised loop, of which more is better."""
+def _loop_gains(
+    spec: TuneSpec, design: DesignFigures, baseline: DesignFigures
+) -> list[dict[str, Any]]:
+    """Figures of the linearised loop: gain margin, slowest decay, and those the tuning names."""
     margins = [x.gain_margin for x in (design, baseline)]
-    decays = [x.slowest_decay for x in (design, baseline)]
-    lost = [after < (1 - ALIKE) * before for after, before in (margins, decays)]
-    change = _percent_change(decays[1], decays[0])
-    return [
-        _gain("gain margin", "", margin_in_db(margins[0], 3), margin_in_db(margins[1], 3), lost[0]),
-        _gain("slowest decay", change, f"{decays[0]:.3g}", f"{decays[1]:.3g} 1/s", lost[1]),
-    ]
+    is_lost = margins[0] < (1 - ALIKE) * margins[1]
+    own, reference = (margin_in_db(x, 3) for x in margins)
+    gains = [_gain("gain margin", "", own, reference, is_lost)]
+    for name in dict.fromkeys(("slowest_decay", *spec.loop_terms, *_of_response(spec))):
+        after, before = (float(getattr(x, name)) for x in (design, baseline))
+        larger = after / before if before else np.nan
+        is_worse = larger < 1 - ALIKE if name in LOWER else larger > 1 + ALIKE
+        unit = "" if unit_text(name) == "1" else f" {unit_text(name)}"
+        gains.append(
+            _gain(
+                name.replace("_", " "),
+                _percent_change(before, after),
+                f"{after:.3g}",
+                f"{before:.3g}{unit}",
+                is_worse,
+            )
+        )
+    return gains
+
+
+def _of_response(spec: TuneSpec) -> list[str]:
+    """Margins and norms by frequency response that the objective or a limit names."""
+    return [name for name in spec.loop_names if name in (*MARGINS, *PEAKS)]
+
+
+def _judged_fresh(spec: TuneSpec, findings: TuneFindings) -> list[str]:
+    """Figures of the loop that are judged on fresh machines."""
+    return [name for name in spec.loop_names if name in findings.baseline.fresh_loop]
+
+
+def _loop_head(name: str) -> str:
+    return headed(name.replace("_", " "), unit_text(name))
 
 
 def _percent_change(before: float, after: float) -> str:
@@ -238,6 +275,7 @@ def summary(spec: TuneSpec, findings: TuneFindings) -> list[str]:
             f"{family.name}: {design.objective.mean():.4f} of the baseline's objective "
             f"on {machines}"
             + (f", worst {design.objective.max():.4f}" if len(design.objective) > 1 else "")
+            + _worst_loops(spec, findings, design)
             + ("; a limit is violated" if lost else "")
             + (f"; stopped by {' and '.join(stops)}" if (stops := active.get(family.name)) else "")
         )
@@ -248,6 +286,16 @@ def summary(spec: TuneSpec, findings: TuneFindings) -> list[str]:
         )
     lines += reference_lines(spec, findings.baseline, findings.references)
     return lines + _unmeasured(spec, findings)
+
+
+def _worst_loops(spec: TuneSpec, findings: TuneFindings, design: JudgedDesign) -> str:
+    """Figures of the loop on the worst fresh machine, "" without any."""
+    texts = [
+        f"{name} {worst_value(name, design.fresh_loop[name]):.4g}"
+        + (f" {unit_text(name)}" if LOOP_UNITS[name] != "1" else "")
+        for name in _judged_fresh(spec, findings)
+    ]
+    return f"; on the worst of them {', '.join(texts)}" if texts else ""
 
 
 def _better_references(spec: TuneSpec, findings: TuneFindings) -> list[str]:
@@ -283,13 +331,11 @@ def _own_machine(spec: TuneSpec, findings: TuneFindings, names: list[str]) -> li
     rows, files = [], ["study.toml", *(file_name(spec, family) for family in spec.moving)]
     for k, (name, design) in enumerate(_designs(spec, findings)):
         cells = [_value(metric, design.own_run.metrics, design.own_run.watched) for metric in names]
-        loop = ["-"] * 3
+        more = _of_response(spec)
+        loop = ["-"] * (3 + len(more))
         if design.loop is not None:
-            loop = [
-                margin_text(design.loop.gain_margin),
-                f"{design.loop.slowest_decay:.4g}",
-                f"{design.loop.spillover:.4g}",
-            ]
+            values = [getattr(design.loop, x) for x in ("slowest_decay", "spillover", *more)]
+            loop = [margin_text(design.loop.gain_margin), *(f"{x:.4g}" for x in values)]
         file = Markup("<code>{}</code>").format(files[k]) if k < len(files) else "-"
         end = status.REASONS[design.own_run.status]
         rows.append([name, file, f"{design.own_run.objective:.4f}", *cells, *loop, end])
@@ -306,6 +352,10 @@ def _fresh(spec: TuneSpec, findings: TuneFindings, names: list[str]) -> list[lis
             for x, k in zip(names, worst, strict=True)
         ]
         objective = [f"{design.objective.mean():.4f}", f"{design.objective.max():.4f}"]
+        cells += [
+            f"{worst_value(x, design.fresh_loop[x]):.4g}" if design.fresh_loop else "-"
+            for x in _judged_fresh(spec, findings)
+        ]
         rows.append([name, *objective, *cells, _codes(design)])
     return rows
 
@@ -358,12 +408,14 @@ def _limits(spec: TuneSpec, findings: TuneFindings) -> list[tuple[str, list[dict
 
 
 def _loop_margin(findings: TuneFindings, k: int, name: str, limit: float | str) -> float:
-    """How far a figure of the loop is from its limit, as a share of it; nan if not known."""
-    loop, baseline = findings.judged[k].loop, findings.baseline.loop
-    if loop is None or baseline is None:
+    """How far a figure is from its limit on the worst machine of the tuning, as a share of it.
+
+    nan if not known.
+    """
+    loop, baseline = findings.judged[k].tuned_loop, findings.baseline.tuned_loop
+    if name not in loop or name not in baseline:
         return float("nan")
-    allowed = getattr(baseline, name) if limit == BASELINE else float(limit)
-    return relative_margin(name, loop, allowed)
+    return relative_margin(name, loop[name], allowed_on(limit, baseline[name]))
 
 
 def _state(beyond: float, left: float) -> str:

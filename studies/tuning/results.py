@@ -5,19 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 from jaxmodel.metrics import METRICS
-from studies.engine.columns import ON_DEMAND
 from studies.space.table import as_numbers
 from studies.store import Variable
 from studies.study.entries import links_text, parse_entries
 from studies.study.labels import STATUS_LABEL
 from studies.study.paths import field_unit, parse_entry
 from studies.tuning.check import JudgedDesign, fresh_columns, patch_centers
+from studies.tuning.loop_figures import LOOP_UNITS
 from studies.tuning.references import ALONE, WITHOUT
 from studies.tuning.report import TuneFindings
+from studies.tuning.scenarios import loop_machines
 from studies.tuning.spec import TuneSpec
 
-#: Figures of the linearised loop, and their units.
-LOOP_UNITS = {"gain_margin": "1", "slowest_decay": "s-1", "spillover": "1"}
+#: Figures of the linearised loop that are always there.
+OF_EVERY_LOOP = ("gain_margin", "slowest_decay", "spillover")
 
 
 def free_unit(key: str) -> str:
@@ -100,8 +101,8 @@ def _starts(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
             at.best_limits,
             ("start", "limit"),
             "1",
-            "negative: satisfied; value over limit - 1 of a metric, for the loop a smooth figure "
-            "that has the same sign",
+            "negative: satisfied; value over limit - 1 of a metric in the worst scenario, for the "
+            "loop a smooth figure that has the same sign, on the worst machine of the tuning",
         )
     return starts
 
@@ -138,16 +139,33 @@ def _fresh(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
             before, (), unit, f"{text}, the baseline's file as it runs"
         )
     if findings.baseline.loop is not None:
-        units = LOOP_UNITS | {
-            name: ON_DEMAND[name][0] for name in spec.loop_limits if name in ON_DEMAND
-        }
-        for name, unit in units.items():
-            label = f"{name.replace('_', ' ')} of the linearised loop"
+        for name in dict.fromkeys((*OF_EVERY_LOOP, *spec.loop_names)):
+            label = f"{name.replace('_', ' ')} of the linearised loop, nominal machine"
             values = np.array([_loop_figure(design, name) for design in findings.judged])
-            fresh[name] = Variable(values, ("family",), unit, label)
+            fresh[name] = Variable(values, ("family",), LOOP_UNITS[name], label)
             baseline = np.array(_loop_figure(findings.baseline, name))
-            fresh[f"baseline_{name}"] = Variable(baseline, (), unit, f"{label}, the baseline")
-    return fresh
+            fresh[f"baseline_{name}"] = Variable(
+                baseline, (), LOOP_UNITS[name], f"{label}, the baseline"
+            )
+    return fresh | _fresh_loops(spec, findings)
+
+
+def _fresh_loops(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
+    """Figures of the loop that the objective or a limit names, on the fresh machines."""
+    of_scenario, variables = loop_machines(spec, fresh_columns(spec)).of_scenario, {}
+    for name in filter(findings.baseline.fresh_loop.__contains__, spec.loop_names):
+        label, unit = f"{name.replace('_', ' ')} of the linearised loop", LOOP_UNITS[name]
+        values = np.stack([design.fresh_loop[name][of_scenario] for design in findings.judged])
+        variables[f"fresh_{name}"] = Variable(
+            values, ("family", "scenario"), unit, f"{label}, fresh machines"
+        )
+        variables[f"fresh_baseline_{name}"] = Variable(
+            findings.baseline.fresh_loop[name][of_scenario],
+            ("scenario",),
+            unit,
+            f"{label}, fresh machines, the baseline",
+        )
+    return variables
 
 
 def _loop_figure(judged: JudgedDesign, name: str) -> float:

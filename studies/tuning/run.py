@@ -201,7 +201,7 @@ def find(spec: TuneSpec, evaluator: Evaluator, at: Progress, phases: Phases) -> 
     searched = None
     if spec.tune.samples:
         phases.begin("random designs", f"{spec.tune.samples} for comparison")
-        searched = search(spec, lambda chosen: evaluator.linear.screen(main, chosen))
+        searched = search(spec, evaluator.linear, main)
     best = at.best_place[at.winner(spec.main)]
     phases.begin("compare derivatives", "with differences")
     audited = audit(spec, np.stack([(spec.free.places() + best) / 2, best]))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
 
+from studies.engine.chunks import distinct_loops
 from studies.show.units import count_text
 from studies.space.axes import column_of
+from studies.study.cases import build_cases, build_structure
 from studies.study.fields import Columns
 from studies.study.paths import LINKS, as_tuples, known_field, set_value
 from studies.study.spec import Study, parse_study
@@ -49,6 +51,43 @@ def scenario_columns(
     for name in spec.tune.scenarios.each:
         columns[name] = np.repeat(column_of([move[name] for move in spec.moves]), count, axis=0)
     return columns
+
+
+class LoopMachines(NamedTuple):
+    """Machines of some scenarios, each once: noise and most moves leave the loop as it is."""
+
+    columns: dict[str, np.ndarray]  # of the first scenario with each, (machines, ...)
+    of_scenario: np.ndarray  # machine of each scenario, (S,)
+
+    @property
+    def size(self) -> int:
+        """How many there are."""
+        return len(self.columns["run.seed"])
+
+
+def loop_machines(spec: TuneSpec, columns: dict[str, np.ndarray]) -> LoopMachines:
+    """Machines whose linearised loops differ, for any law and drive of the tuning.
+
+    Args:
+        spec: of the tuning.
+        columns: from `scenario_columns`.
+    """
+    every = []
+    for parts in dict.fromkeys([spec.parts(), *map(spec.parts, spec.families)]):
+        study = spec.studies(parts)[0]
+        every.append(distinct_loops(build_cases(study, columns, build_structure(study)))[1])
+    loops = np.stack(every, axis=1)
+    loops = np.broadcast_to(loops, (len(columns["run.seed"]), loops.shape[1]))
+    _, first, own = np.unique(loops, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    kept = {name: column[first[order]] for name, column in columns.items()}
+    return LoopMachines(kept, np.argsort(order)[np.ravel(own)])
+
+
+def tuned_machines(spec: TuneSpec) -> LoopMachines:
+    """Machines of a tuning, the nominal one first."""
+    scenarios = spec.tune.scenarios
+    return loop_machines(spec, scenario_columns(spec, scenarios.count, scenarios.seed))
 
 
 def fresh_machines(spec: TuneSpec) -> str:

@@ -3,11 +3,13 @@
 Everything is measured against the baseline, machine by machine and move by move:
 
 - objective: sum of weight times the size of a metric (root of the mean square of its entries) over
-  its size in the baseline's run of that scenario; of the scenarios, the mean of the worst share;
+  its size in the baseline's run of that scenario, or of a figure of the loop over that of the
+  baseline's loop on that machine, the other way round where more is better; of the scenarios, the
+  mean of the worst share;
 - limits: the largest entry of a metric must not exceed the limit in any scenario; "baseline"
   stands for the baseline's value there. `gain_margin`, `slowest_decay` and the margins of
   `jaxmodel.robustness` are lower limits, `spillover` and the peaks there upper ones, of the
-  linearised sampled loop at the first way-point;
+  linearised sampled loop at the first way-point, on every machine;
   `singularity_distance` is a lower limit on the distance of all link angles from 0 and 90 deg.
 """
 
@@ -49,6 +51,8 @@ from studies.tuning.free import free_numbers, writes
 OF_LOOP = ("gain_margin", "slowest_decay", "spillover", *MARGINS, *PEAKS)
 #: and with that of the mechanism.
 LOOP_LIMITS = (*OF_LOOP, "singularity_distance")
+#: Those that can be terms of an objective as well.
+LOOP_TERMS = ("slowest_decay", "spillover", *MARGINS, *PEAKS)
 #: Lower ones among them; the others are upper ones.
 LOWER = ("gain_margin", "slowest_decay", "singularity_distance", *MARGINS)
 #: Runs in one batch.
@@ -81,10 +85,13 @@ class Tune(Section):
 
     free: dict[str, Any] = described({}, "-", "field = {from, to, scale}")
     objective: dict[str, Any] = described(
-        {"residual_rms": 1.0}, "-", "metric = weight, relative to the baseline", min_length=1
+        {"residual_rms": 1.0},
+        "-",
+        "metric or figure of the loop = weight, relative to the baseline",
+        min_length=1,
     )
     limits: dict[str, Any] = described(
-        {}, "-", "metric or figure of the loop = limit or 'baseline'"
+        {}, "-", "metric or figure of the loop = limit or 'baseline', on every machine"
     )
     scenarios: Scenarios = Scenarios()
     families: dict[str, Any] = described({}, "-", "name = {free, set}: what moves, what is set")
@@ -161,6 +168,21 @@ class TuneSpec(NamedTuple):
         )
 
     @property
+    def metric_terms(self) -> tuple[str, ...]:
+        """Terms of the objective that are metrics of runs."""
+        return tuple(name for name in self.tune.objective if name not in LOOP_TERMS)
+
+    @property
+    def loop_terms(self) -> tuple[str, ...]:
+        """Terms of the objective that are figures of the linearised loop."""
+        return tuple(name for name in self.tune.objective if name in LOOP_TERMS)
+
+    @property
+    def loop_names(self) -> tuple[str, ...]:
+        """Figures of the linearised loop that the objective or a limit names."""
+        return tuple(dict.fromkeys((*self.loop_limits, *self.loop_terms)))
+
+    @property
     def metric_limits(self) -> tuple[str, ...]:
         """Limits on metrics of runs."""
         return tuple(name for name in self.tune.limits if name not in LOOP_LIMITS)
@@ -210,6 +232,7 @@ def parse_tuning(data: dict[str, Any]) -> TuneSpec:
     moves = _moves(tune, study)
     families = _families(tune, study, free)
     _check_clashes(tune, free, families)
+    _check_switching(tune, study, families)
     _check_size(tune, families, len(moves))
     for family in families:
         for move in moves:
@@ -221,10 +244,10 @@ def parse_tuning(data: dict[str, Any]) -> TuneSpec:
 
 def _check_figures(tune: Tune, study: Study) -> None:
     for name, weight in tune.objective.items():
-        _check_metric(name, "tune.objective", False, study)
+        _check_metric(name, "tune.objective", LOOP_TERMS, study)
         _check_positive(weight, 1e30, f"tune.objective.{shown_name(name)}")
     for name, limit in tune.limits.items():
-        _check_metric(name, "tune.limits", True, study)
+        _check_metric(name, "tune.limits", LOOP_LIMITS, study)
         if limit != BASELINE:
             path, hint = f"tune.limits.{shown_name(name)}", BASELINE * isinstance(limit, str)
             _check_positive(limit, 1e30, path, more=f" or {BASELINE!r}", hint=hint)
@@ -303,13 +326,26 @@ def others(values: list[Any], count: int, is_fresh: bool) -> list[Any]:
 def _check_feedback(tune: Tune, study: Study) -> None:
     if study.control.ratio_source != "given":
         raise field_error("control.ratio_source", study.control.ratio_source, "'given' in a tuning")
-    loop_limits = [name for name in tune.limits if name in OF_LOOP]
-    if study.control.feedback != "sampled" and loop_limits:
-        raise field_error(
-            "control.feedback",
-            study.control.feedback,
-            "'sampled' where tune.limits holds " + " or ".join(loop_limits),
-        )
+    for path, names in (("tune.limits", tune.limits), ("tune.objective", tune.objective)):
+        of_loop = [name for name in names if name in OF_LOOP]
+        if study.control.feedback != "sampled" and of_loop:
+            raise field_error(
+                "control.feedback",
+                study.control.feedback,
+                f"'sampled' where {path} holds " + " or ".join(of_loop),
+            )
+
+
+def _check_switching(tune: Tune, study: Study, families: tuple[Family, ...]) -> None:
+    """A law that switches between modes has a loop for each, which no term stands for."""
+    terms = [name for name in tune.objective if name in LOOP_TERMS]
+    for columns in ({}, *(family.columns for family in families)):
+        law = parts_of(study, columns).law
+        if terms and LAWS[law].is_switching:
+            raise StudyError(
+                f"tune.objective.{terms[0]}: control.law {law!r} switches between loops; allowed: "
+                "laws with one linear loop, or a limit instead"
+            )
 
 
 def _check_positive(
@@ -320,19 +356,26 @@ def _check_positive(
         raise field_error(path, number, f"a number > 0 and <= {most:g}{more}", unit, hint)
 
 
-def _check_metric(name: str, path: str, has_loop: bool, study: Study) -> None:
-    if has_loop and name in LOOP_LIMITS:
+def _check_metric(name: str, path: str, of_loop: tuple[str, ...], study: Study) -> None:
+    """Check a metric, or a figure of the loop that is one of `of_loop`."""
+    if name in of_loop:
         return
-    if has_loop and _field(name) in LOOP_LIMITS:
+    is_objective = of_loop == LOOP_TERMS
+    if _field(name) in of_loop:
         raise StudyError(f"{path}: {name!r} has no such entry; allowed: {_field(name)}")
-    allowed = [*METRICS, *(LOOP_LIMITS if has_loop else ())]
+    if is_objective and _field(name) in LOOP_LIMITS:
+        raise StudyError(
+            f"{path}: {name!r} can only be a limit"
+            + (", it has no derivative; take disk_margin" if name == "gain_margin" else "")
+        )
+    allowed = [*METRICS, *of_loop]
     if _field(name) not in allowed:
         hint = nearest(name, allowed)
         raise StudyError(
             f"{path}: {name!r}: unknown metric; "
             + (f"did you mean {hint!r}?" if hint else f"allowed: {', '.join(allowed)}")
         )
-    if not has_loop and not METRICS[_field(name)].is_differentiable:
+    if is_objective and not METRICS[_field(name)].is_differentiable:
         raise StudyError(
             f"{path}: {_field(name)} moves in steps and has no derivative"
             + ("; take ringing_time" if _field(name) == "settling_time" else "; limit it instead")
