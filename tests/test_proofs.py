@@ -313,8 +313,8 @@ def test_certificates_hold_their_proofs():
     found = certify(STUDY, sizes=(3,), bases=(SINES,), mismatches=(ModelMismatch(),))
     for proofs in (None, PROVEN):
         found = found._replace(proofs=proofs)
-        data = json.loads(document(found, None))
+        data = json.loads(document(found))
         jsonschema.validate(data, schema("spillover"))
         assert (data["proofs"] is None) == (proofs is None)
-        assert ("Proven: no unstable machine" in report(found, None)) == (proofs is not None)
+        assert ("Proven: no unstable machine" in report(found)) == (proofs is not None)
     assert data["proofs"]["box"]["is_proven"] and data["proofs"]["all_modes"]["gain_margin"] == 3.5
