@@ -32,6 +32,7 @@ from studies.spillover import ModelMismatch, certify, patch_lengths
 from studies.spillover import run as spillover_run
 from studies.spillover.fast_move import FAST, WINDOW, make_fast, run_fast_move
 from studies.spillover.plants import LoopBuilder, all_plants, pad_channels
+from studies.spillover.proofs import BOX, AllModes, Proofs, ProvenBox
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import paper_study
 from studies.study.template import study_template
@@ -490,6 +491,25 @@ def test_command_fails_a_design(capsys, monkeypatch, tmp_path):
     data = json.loads((out / "certificate.json").read_text())
     jsonschema.validate(data, schema("spillover"))
     assert not data["is_passed"]
+
+
+def test_command_fails_a_design_with_an_unstable_machine_in_its_box(
+    capsys, monkeypatch, tmp_path, move
+):
+    few(monkeypatch, lambda study: move)
+    box = ProvenBox(BOX, 1.0, True, 12, cells=0, seconds=0.0, unstable=(0.95, 1.0, 0.1))
+    monkeypatch.setattr(spillover_run, "prove", lambda _: Proofs(AllModes(3.5, 3.7, 12), box))
+    monkeypatch.setattr(
+        spillover_run.figures,
+        "save",
+        lambda _, out, name, __: (out / f"{name}.png").write_bytes(b"-"),
+    )
+    out = tmp_path / "out"
+    code, text, _ = run(capsys, "spillover", write(tmp_path), "--out", out, "--prove")
+    assert code == 1 and "passed" not in text
+    wanted = "failed by an unstable machine in the box: stiffness x 0.95, 1 sample of extra delay"
+    assert wanted in text and "on the plants: gain margin 2.88, 2 required" in text
+    assert not json.loads((out / "certificate.json").read_text())["is_passed"]
 
 
 def test_a_certificate_is_written_whole_or_not_at_all(capsys, monkeypatch, tmp_path, move):

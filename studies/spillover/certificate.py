@@ -88,8 +88,16 @@ class Certificate(NamedTuple):
 
     @property
     def is_passed(self) -> bool:
-        """Whether all of them do."""
-        return bool(self.passes[self.exists].all())
+        """Whether all of them do, and proofs found no unstable machine.
+
+        What proofs leave undecided does not fail a design.
+        """
+        return bool(self.passes[self.exists].all()) and self.unstable_machine is None
+
+    @property
+    def unstable_machine(self) -> tuple[float, float, float] | None:
+        """The one that proofs found: factor on stiffness [1], delay [samples], payload [kg]."""
+        return None if self.proofs is None else self.proofs.box.unstable
 
     @property
     def spillover(self) -> Spillover | None:

@@ -18,7 +18,7 @@ from studies.show.sketch import CAPTION
 from studies.spillover.certificate import Certificate, Spillover
 from studies.spillover.fast_move import FAST, WINDOW, FastMove
 from studies.spillover.plants import PlantVariant
-from studies.spillover.proofs import Proofs, proof_texts
+from studies.spillover.proofs import Proofs, machine_text, proof_texts
 from studies.study.labels import describe
 from studies.study.margin import margin_text
 from studies.study.window import residual_delay
@@ -28,14 +28,20 @@ TINY = 1e-9
 
 
 def verdict(certificate: Certificate) -> str:
-    """One line: passed or failed, and the deciding plant."""
-    at = certificate.worst
-    margin, breaking = margin_text(certificate.margin[at], 3), certificate.breaking[at]
+    """One line: passed or failed, and the deciding plant or machine."""
+    at, machine = certificate.worst, certificate.unstable_machine
+    breaking = certificate.breaking[at]
+    margin = (
+        f"gain margin {margin_text(certificate.margin[at], 3)}, {certificate.required:g} required"
+    )
     if certificate.is_passed:
         first = f"; first to go unstable beyond it: {breaking}" if breaking else ""
-        return f"passed: gain margin {margin}, {certificate.required:g} required{first}"
+        return f"passed: {margin}{first}"
+    unstable = "" if machine is None else f"unstable machine in the box: {machine_text(machine)}"
+    if certificate.fails_from == 0:
+        return f"failed by an {unstable}; on the plants: {margin}"
     state = "" if certificate.radius[at] <= 1 + RADIUS_TOLERANCE else "unstable, "
-    return f"failed by {breaking}: {state}gain margin {margin}, {certificate.required:g} required"
+    return f"failed by {breaking}: {state}{margin}{unstable and f'; {unstable}'}"
 
 
 def spillover_text(certificate: Certificate) -> str:
@@ -116,6 +122,7 @@ def report(certificate: Certificate, images: Path | None = None) -> str:
         change_rows=_changes(certificate),
         damping=damping_text(certificate),
         proofs=proof_texts(certificate.proofs) if certificate.proofs is not None else (),
+        machine=machine_text(certificate.unstable_machine) if certificate.unstable_machine else "",
         margin=margin,
         worst=certificate.plants[certificate.worst],
         share=margin / certificate.required,

@@ -62,7 +62,8 @@ def spillover_design(
         tolerances: units of the smallest change that breaks it, see `smallest_change`.
 
     Returns:
-        the certificate; `is_passed`: whether the design passes.
+        the certificate; `is_passed`: whether the design passes on every plant, and proofs found no
+        unstable machine.
 
     Raises:
         StudyError: as `certify`, or a folder that cannot be written to.
@@ -75,15 +76,11 @@ def spillover_design(
     with Phases(console, names) as phases:
         phases.begin("judge", "the controller on plants that differ from its nominal model")
         certificate = certify(study, margin)
-        console.print(verdict(certificate), soft_wrap=True)
-        for text in filter(None, (damping_text(certificate), spillover_text(certificate))):
-            console.print(text, soft_wrap=True)
         if has_proofs:
             phases.begin("prove", "every number of modes, and a box of machines")
-            proofs = prove(fixed_controller(study))
-            certificate = certificate._replace(proofs=proofs)
-            for text in proof_texts(proofs):
-                console.print(text, soft_wrap=True)
+            certificate = certificate._replace(proofs=prove(fixed_controller(study)))
+        for text in _statements(certificate):
+            console.print(text, soft_wrap=True)
         phases.begin("smallest change", "of the machine that breaks the design")
         change = smallest_change(fixed_controller(certificate.study), tolerances)
         certificate = certificate._replace(smallest_change=change)
@@ -118,6 +115,13 @@ def _check_owner(out: Path, study: Study) -> None:
         raise StudyError(
             f"--out {out}: has the certificate of another design; give another folder, or delete it"
         )
+
+
+def _statements(certificate: Certificate) -> list[str]:
+    """Lines to print: the verdict, what becomes of modes, what is proven."""
+    texts = verdict(certificate), damping_text(certificate), spillover_text(certificate)
+    proven = () if certificate.proofs is None else proof_texts(certificate.proofs)
+    return [text for text in (*texts, *proven) if text]
 
 
 def _with_fast_move(certificate: Certificate) -> Certificate:
