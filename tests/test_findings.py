@@ -8,7 +8,7 @@ import pytest
 
 from jaxmodel import status
 from studies.spillover.certificate import Certificate
-from studies.spillover.fast_move import FastMove
+from studies.spillover.fast_move import ControlEffect
 from studies.spillover.plants import ModelMismatch, PlantVariant
 from studies.spillover.report import document, residual_text, verdict
 from studies.spillover.report import report as certificate_report
@@ -75,7 +75,7 @@ def certificate(required=2.0, **changes):
 
 def fast_move(**changes):
     rms = 1e-6 * np.array([[1.5, 2.5, 0.5], [30.0, 20.0, 40.0]])
-    return FastMove(STUDY, rms, np.array([status.OK, status.OK]))._replace(**changes)
+    return ControlEffect(STUDY, rms, np.array([status.OK, status.OK]))._replace(**changes)
 
 
 def test_a_certificate_s_table_of_plants():

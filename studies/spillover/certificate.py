@@ -16,7 +16,7 @@ from studies.engine.host_loop import SampledLoop, name_motion
 from studies.engine.stability import LoopFigures, judge_loop, worst_figures
 from studies.errors import StudyError, field_error
 from studies.publish import shown
-from studies.spillover.fast_move import FastMove
+from studies.spillover.fast_move import ControlEffect
 from studies.spillover.plants import (
     MISMATCHES,
     LoopBuilder,
@@ -69,7 +69,7 @@ class Certificate(NamedTuple):
     notes: tuple[str, ...]  # what was left out, and why
     proofs: Proofs | None = None  # beyond these plants, if they were asked for
     smallest_change: BreakingChange | None = None  # that breaks the design; None: not looked for
-    fast_move: FastMove | None = None  # of the nominal machine; None: not run
+    fast_move: ControlEffect | None = None  # of the nominal machine; None: not run
 
     def _repr_html_(self) -> str:
         return shown(self)

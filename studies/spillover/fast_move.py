@@ -20,8 +20,8 @@ FAST = (0.01, 0.03)  # [m], [s]
 WINDOW = 0.15
 
 
-class FastMove(NamedTuple):
-    """Residual vibration after it; first with control, then without."""
+class ControlEffect(NamedTuple):
+    """Residual vibration after the fast move; first with control, then without."""
 
     study: Study  # the design's first move made fast
     residual_rms: np.ndarray  # worst station of each link [m], (2, 3)
@@ -40,7 +40,7 @@ class FastMove(NamedTuple):
         return np.asarray(self.residual_rms.max(axis=1))
 
 
-def run_fast_move(study: Study) -> FastMove:
+def run_fast_move(study: Study) -> ControlEffect:
     """Run a design's first move made fast, nonlinear, with and without control.
 
     Args:
@@ -53,7 +53,7 @@ def run_fast_move(study: Study) -> FastMove:
     structure, case = check_run(fast)
     both = jax.tree.map(lambda *x: np.stack(x), case, uncontrolled(case))
     result = _simulate(structure._replace(metrics=("residual_rms",)), both)
-    return FastMove(
+    return ControlEffect(
         study=fast,
         residual_rms=np.asarray(result.metrics.residual_rms).max(axis=2),
         status=np.asarray(result.status),

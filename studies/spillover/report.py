@@ -16,7 +16,7 @@ from studies.show.document import json_text
 from studies.show.pages import page
 from studies.show.sketch import CAPTION
 from studies.spillover.certificate import Certificate, Spillover
-from studies.spillover.fast_move import FAST, WINDOW, FastMove
+from studies.spillover.fast_move import FAST, WINDOW, ControlEffect
 from studies.spillover.plants import PlantVariant
 from studies.spillover.proofs import Proofs, machine_text, proof_texts
 from studies.study.labels import describe
@@ -218,7 +218,7 @@ def _largest(certificate: Certificate, leakage: np.ndarray) -> dict[str, Any]:
     return {"size": size.max(), "mode": mode, "controlled": int(j) + 1, "plant": plant}
 
 
-def _fast_rows(move: FastMove) -> list[list[str]]:
+def _fast_rows(move: ControlEffect) -> list[list[str]]:
     """Row of each run."""
     return [
         [how, " / ".join(f"{1e6 * x:.3g}" for x in rms), describe(int(code))]
@@ -275,7 +275,7 @@ def _proofs(proofs: Proofs) -> dict[str, Any]:
     }
 
 
-def _fast_move(move: FastMove) -> dict[str, Any]:
+def _fast_move(move: ControlEffect) -> dict[str, Any]:
     return {
         "move_time_s": move.move_time,
         "residual_rms_m": move.residual_rms[0],
