@@ -16,11 +16,12 @@ from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
 from jaxmodel.delay import LONGEST
 from jaxmodel.prepare import design_controller
+from jaxmodel.sampled_loop import RADIUS_TOLERANCE, closed_loop
 from jaxmodel.simulate import simulate
 from jaxmodel.state_space import dense
 from studies.engine.preflight import check_run
 from studies.engine.robustness import judge_robustness
-from studies.engine.stability import loop_report
+from studies.engine.stability import loop_report, with_margin_modes
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.margin import MARGIN_MODES
 from studies.study.spec import Study, parse_study
@@ -231,14 +232,18 @@ def drawn_loop(k: int, duration: float) -> DrawnLoop:
         structure, case = check_run(study)  # plant steps as a run has them
         gain_margin = loop_report(structure, case, np.array(HOME)).gain_margin
         case = _with(case, share * gain_margin)  # which leaves a margin of 1/share
-        one = jax.tree.map(lambda x: np.asarray(x)[None], case)
-        judged = judge_robustness(structure, one, ("delay_margin",), np.array([1 / share]))
-        found.append(float(judged["delay_margin"][0]))
+        found.append(_delay_margin(structure, case, 1 / share))
         room = LONGEST - float(case.electronics.delay)
         if LEAST_DELAY < found[-1] < room / (1 + WITHIN):
             structure = structure._replace(has_delay=True)
             return DrawnLoop(structure, case, 1 / share, found[-1])
     raise AssertionError(f"design {k}: no delay margin that can be simulated in {found}")
+
+
+def _delay_margin(structure: Structure, case: Case, gain_margin: float) -> float:
+    one = jax.tree.map(lambda x: np.asarray(x)[None], case)
+    judged = judge_robustness(structure, one, ("delay_margin",), np.array([gain_margin]))
+    return float(judged["delay_margin"][0])
 
 
 def _with(case: Case, factor, delay=0.0) -> Case:
@@ -294,3 +299,39 @@ def test_runs_of_random_designs_grow_beyond_their_margins():
             checked += 1
         jax.clear_caches()
     assert not wrong and checked == N_DESIGNS, wrong
+
+
+@partial(jax.jit, static_argnums=0)
+def _loop(structure, case, factor, delay):
+    matrices = closed_loop(structure, _with(case, factor, delay), np.array(HOME))
+    return matrices.open + matrices.feedback
+
+
+def delay_margins_are_those_of_eigenvalues(k: int, draw: int, shares: tuple[float, ...]) -> None:
+    """Stable up to 0.98 of it, unstable at 1.02, as far as delays are simulated."""
+    structure, case = check_run(random_design(k, draw, 0.1)[0])
+    wide = with_margin_modes(structure._replace(has_delay=True), case)
+    margin = loop_report(structure, case, np.array(HOME)).gain_margin
+    room = LONGEST - float(case.electronics.delay)
+    for share in shares:
+        late = _delay_margin(structure, _with(case, share * margin), 1 / share)
+
+        def excess(delay, share=share):
+            return np.abs(np.linalg.eigvals(_loop(*wide, share * margin, delay))).max() - 1
+
+        before = np.linspace(0, min(0.98 * late, room), 7)
+        assert all(excess(delay) <= RADIUS_TOLERANCE for delay in before), (draw, share, late)
+        assert 1.02 * late > room or excess(1.02 * late) > 0, (draw, share, late)
+
+
+def test_a_delay_margin_where_images_change_the_modulus():
+    """At 984 Hz, sampled at 8 kHz: what later images do to |L| moves the crossing by 20 Hz."""
+    delay_margins_are_those_of_eigenvalues(7, 2, (0.9,))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("k", [k for k in range(N_DESIGNS) if k % len(DRAWS) != 1])
+def test_delay_margins_of_random_designs_are_those_of_eigenvalues(k):
+    """Of laws that do not switch."""
+    for draw in range(3):
+        delay_margins_are_those_of_eigenvalues(k, draw, (0.9, 0.75, 0.6, 0.45, 0.3))

@@ -204,15 +204,20 @@ def _at_levels(
         for more in (0.0, SLIGHT)
     )
     now = _nearest(now, np.exp(places.log))
-    rate = np.angle(_nearest(later, now) / now) / SLIGHT
-    rate = np.where(np.abs(rate) < 1e-3, 1e-3, rate)
+    rate = np.log(_nearest(later, now) / now) / SLIGHT
     angle = places.log.imag[:, None] - (places.omega * period)[:, None] * whole
-    shift = -((angle + np.pi) % (2 * np.pi) - np.pi) / rate[:, None]
+    angle = (angle + np.pi) % (2 * np.pi) - np.pi
+    slope = places.slope[:, None] - 1j * period[:, None] * whole
+    # later images also change the modulus, so where it is 1 moves along the axis
+    moved = -rate.real[:, None] / np.where(slope.real == 0, 1e-300, slope.real)
+    along = rate.imag[:, None] + slope.imag * moved
+    shift = -angle / np.where(np.abs(along) < 1e-3, 1e-3, along)
     delay = places.level[:, None] + whole + shift
     row, late = np.nonzero((np.abs(shift) < 1 / LEVELS) & (delay > 0))
     chosen = places.chosen(row)
-    chosen = chosen._replace(slope=chosen.slope - 1j * period[row] * whole[late])
-    return chosen, delay[row, late], 1j * rate[row]
+    omega = chosen.omega + moved[row, late] * shift[row, late]
+    chosen = chosen._replace(omega=omega, slope=slope[row, late])
+    return chosen, delay[row, late], rate[row]
 
 
 def _nearest(candidates: np.ndarray, value: np.ndarray) -> np.ndarray:
