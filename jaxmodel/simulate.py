@@ -11,7 +11,6 @@ import numpy as np
 from jaxmodel import metrics, status
 from jaxmodel.axial import axial_force, critical_force, euler_force
 from jaxmodel.case import Case, Load, Structure
-from jaxmodel.controller import Controller
 from jaxmodel.delay import command_change, true_delay
 from jaxmodel.drives import DRIVES
 from jaxmodel.dynamics import inverse_dynamics, with_platform
@@ -253,13 +252,12 @@ class Start(NamedTuple):
     outline: Outline
 
 
-def begin(structure: Structure, case: Case, law: Controller | None = None) -> Start:
+def begin(structure: Structure, case: Case) -> Start:
     """Do everything that precedes the first step.
 
     Args:
         structure: static choices.
         case: the numbers.
-        law: controller instead of the case's own.
 
     Returns:
         Start.
@@ -268,8 +266,6 @@ def begin(structure: Structure, case: Case, law: Controller | None = None) -> St
     outside = command(structure, case, prepared)
     code = jnp.where(prepared.status == status.OK, outside.status, prepared.status)
     loop = prepared.loop
-    if law is not None:
-        loop = loop._replace(controller=law)
     return Start(
         loop,
         outside.inputs,
@@ -345,16 +341,13 @@ def conclude(outline: Outline, code: Array, last: State, record: Record | None =
     )
 
 
-def simulate(
-    structure: Structure, case: Case, has_record: bool = False, law: Controller | None = None
-) -> Result:
+def simulate(structure: Structure, case: Case, has_record: bool = False) -> Result:
     """Run one case with the reference executor, a scan; other executors replace only the scan.
 
     Args:
         structure: static choices.
         case: the numbers; `jax.vmap` over any of them.
         has_record: return trajectories too (static).
-        law: controller instead of the case's own, as for `sampled_loop.closed_loop`.
 
     Returns:
         Result, whose `status` says what went wrong; nothing is raised inside. Its derivatives are
@@ -362,7 +355,7 @@ def simulate(
     """
     has_converters = structure.feedback == "sampled" and not structure.is_smooth
     run = _rounded() if has_converters else _run
-    return run(structure, has_record, case, law)
+    return run(structure, has_record, case)
 
 
 @cache
@@ -381,8 +374,8 @@ def _smooth_tangent(
     return _run(structure, has_record, *primals), jax.jvp(smooth, primals, tangents)[1]
 
 
-def _run(structure: Structure, has_record: bool, case: Case, law: Controller | None) -> Result:
-    start = begin(structure, case, law)
+def _run(structure: Structure, has_record: bool, case: Case) -> Result:
+    start = begin(structure, case)
 
     def body(state: Any, inputs: Any) -> Any:
         after, record = step(structure, start.loop, state, inputs)

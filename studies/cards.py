@@ -135,9 +135,9 @@ def _certificate(certificate: Any) -> Card:
     """Of `certify` and `spillover_design`."""
     from studies.spillover.plots import margins
     from studies.spillover.proofs import proof_texts
-    from studies.spillover.report import damping_text, spillover_text, verdict
+    from studies.spillover.report import damping_text, residual_text, spillover_text, verdict
 
-    texts = damping_text(certificate), spillover_text(certificate)
+    texts = [text(certificate) for text in (damping_text, spillover_text, residual_text)]
     proven = () if certificate.proofs is None else proof_texts(certificate.proofs)
     lines = [verdict(certificate), *texts, *proven, *certificate.notes]
     least = np.argsort(np.where(certificate.exists, certificate.margin, np.inf), axis=None)

@@ -28,7 +28,7 @@ from tests.sweeps import small_spec
 from tests.test_kernel import both, check_equal
 from tests.test_margins import assert_return_difference
 from tests.test_notch import NOTCHES
-from tests.test_onset import BASE, HOME, LIMIT
+from tests.test_onset import BASE, HOME, is_growing
 from tests.tunings import GAIN, SMALL
 
 POSE = np.array(HOME)
@@ -251,12 +251,7 @@ def test_delay_of_one_sample_costs_nothing():
 def grows(structure, case, delay):
     """Whether a small vibration grows under more delay than the controller knows [samples]."""
     electronics = case.electronics._replace(unmodelled_delay=delay)
-    voltage = np.asarray(_record(structure, case._replace(electronics=electronics)))
-    if np.abs(voltage).max() >= LIMIT:
-        return True
-    size = np.sqrt(np.mean(voltage**2, axis=(1, 2)))
-    tenth = len(size) // 10
-    return bool(size[-tenth:].mean() > size[-4 * tenth : -3 * tenth].mean())
+    return is_growing(_record(structure, case._replace(electronics=electronics)))
 
 
 @partial(jax.jit, static_argnums=0)

@@ -8,9 +8,9 @@ import pytest
 
 from jaxmodel import status
 from studies.spillover.certificate import Certificate
-from studies.spillover.comparison import GIVEN, WITHOUT, Comparison
+from studies.spillover.fast_move import ControlEffect
 from studies.spillover.plants import ModelMismatch, PlantVariant
-from studies.spillover.report import document, verdict
+from studies.spillover.report import document, residual_text, verdict
 from studies.spillover.report import report as certificate_report
 from studies.study.margin import margin_in_db
 from studies.study.spec import paper_study
@@ -73,28 +73,14 @@ def certificate(required=2.0, **changes):
     return Certificate(**(values | changes))
 
 
-def comparison():
-    rng = np.random.default_rng(4)
-    names = (WITHOUT, GIVEN, "imsc", "ppf")
-    return Comparison(
-        study=STUDY,
-        required=2.5,
-        plant=PlantVariant("pinned_pinned", 5),
-        names=names,
-        factor=np.array([0.0, 1.0, 1.234, 0.567]),
-        damping_ratio=np.where(np.arange(3) < 2, rng.uniform(0.01, 0.3, (4, 3)), np.nan),
-        margin=np.array([np.nan, 3.456, 64.0, 2.345]),
-        breaking=("", "mode 7", "", "mode 5"),
-        residual_rms=1e-6 * rng.uniform(1, 9, (4, 3)),
-        peak_voltage=rng.uniform(10, 90, 4),
-        control_energy=rng.uniform(0.1, 0.9, 4),
-        status=np.array([0, 0, status.SATURATED, 0]),
-    )
+def fast_move(**changes):
+    rms = 1e-6 * np.array([[1.5, 2.5, 0.5], [30.0, 20.0, 40.0]])
+    return ControlEffect(STUDY, rms, np.array([status.OK, status.OK]))._replace(**changes)
 
 
 def test_a_certificate_s_table_of_plants():
     found = certificate()
-    (table,) = tables_of(certificate_report(found, None))["Margins and damping"]
+    (table,) = tables_of(certificate_report(found))["Margins and damping"]
     assert list(table) == [
         "basis",
         "model mismatch",
@@ -125,7 +111,7 @@ def test_a_certificate_s_table_of_plants():
 
 def test_a_certificate_s_table_of_leakage():
     found = certificate()
-    html = certificate_report(found, None)
+    html = certificate_report(found)
     text = text_of(html)
     (table,) = tables_of(html)["Observation and control spillover"]
     size = np.abs(found.observation).max(axis=(1, 2))
@@ -143,41 +129,63 @@ def test_a_certificate_s_table_of_leakage():
     assert f"up to {pushed.max():.3g} of itself (mode {j + 1} on mode {r + 3}, {BASES[b]})" in words
 
 
-def test_a_certificate_s_table_of_laws():
-    found, laws = certificate(), comparison()
-    html = certificate_report(found, laws)
-    text = text_of(html)
-    (table,) = tables_of(html)["Laws"]
-    rms = laws.residual_rms
-    assert table["law"] == list(laws.names)
-    assert_cells(table["factor"], laws.factor, 3)
-    for j in (0, 1):
-        assert_cells(table[f"zeta {j + 1}"], laws.damping_ratio[:, j], 3)
-    assert table["zeta 3"] == ["-"] * 4
-    assert table["margin"] == ["-", "3.46", "> 64", f"{2.345:.3g}"]
-    assert table["broken by"] == ["-", "mode 7", "-", "mode 5"]
-    links = [" / ".join(f"{1e6 * x:.3g}" for x in row) for row in rms]
-    assert table["residual rms of links 1 / 2 / 3 [µm]"] == links
-    share = [f"{100 * np.mean(row / rms[0]):.3g} %" for row in rms]
-    assert table["relative to no control"] == share and share[0] == "100 %"
-    assert_cells(table["peak [V]"], laws.peak_voltage, 3)
-    assert_cells(table["energy [V² s]"], laws.control_energy, 3)
-    assert table["run"] == ["ok", "ok", "actuators saturated too often", "ok"]
-    assert len(table) == 12
-    words = " ".join(text.split())
-    assert "a gain margin of 2.5 on the nominal plant (pinned_pinned, as modelled)" in words
-    assert "with 5 plant modes per link. Nonlinear run:" in words
-    left, free = (1e6 * rms[k].max() for k in (1, 0))
-    assert (
-        f"the design leaves {left:.4g} µm rms on its worst link ({free:.4g} without control, "
-        f"{100 * (left / free - 1):+.3g} %)." in words[: words.index("**Question:**")]
-    )
+def test_a_certificate_s_table_of_the_fast_move():
+    html = certificate_report(certificate(fast_move=fast_move()))
+    (table,) = tables_of(html)["The fast move"]
+    assert table["control"] == ["on", "off"] and table["run"] == ["ok", "ok"]
+    assert table["residual rms of links 1 / 2 / 3 [µm]"] == ["1.5 / 2.5 / 0.5", "30 / 20 / 40"]
+    assert "`studies laws DESIGN --out DIR`" in text_of(html)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({}, "2.5 µm rms on its worst link, 40 without control, -93.8 %"),
+        (
+            {"status": np.array([status.SATURATED, status.OK])},
+            "-93.8 % (run with control: actuators saturated too often)",
+        ),
+        (
+            {"residual_rms": 1e-6 * np.array([[50.0, 1, 1], [40.0, 1, 1]])},
+            "50 µm rms on its worst link, 40 without control, +25 %",
+        ),
+        (
+            {"residual_rms": 1e-6 * np.array([[1.0, 1, 1], [0.0, 0, 0]])},
+            "1 µm rms on its worst link, 0 without control",
+        ),
+        (
+            {
+                "residual_rms": np.array([[np.nan] * 3, [1e-6] * 3]),
+                "status": np.array([status.NON_FINITE, status.OK]),
+            },
+            "no figure (run with control: ",
+        ),
+    ],
+)
+def test_a_certificate_says_what_control_leaves(changes, sentence):
+    """In the result, in JSON, and in capitals where it makes things worse."""
+    found = certificate(fast_move=fast_move(**changes))
+    text = residual_text(found)
+    assert sentence in text
+    is_worse = bool(found.fast_move.worst[0] > found.fast_move.worst[1])
+    assert text.startswith("CONTROL MAKES IT WORSE: ") == is_worse
+    words = " ".join(text_of(certificate_report(found)).split())
+    assert text[1:] in words[: words.index("**Question:**")]
+    kept = json.loads(document(found))["fast_move"]
+    rms = found.fast_move.residual_rms[0]
+    assert kept["residual_rms_m"] == [None if np.isnan(x) else x for x in rms]
+
+
+def test_a_certificate_without_a_fast_move_says_nothing_of_it():
+    found = certificate()
+    assert residual_text(found) == "" and json.loads(document(found))["fast_move"] is None
+    assert "The fast move" not in certificate_report(found)
 
 
 def test_a_certificate_s_sentences():
     found = certificate()
     margin = np.nanmin(found.margin)
-    words = text_of(certificate_report(found, None))
+    words = text_of(certificate_report(found))
     at = found.plants[np.unravel_index(np.nanargmin(found.margin), found.margin.shape)]
     free = found.free_damping
     last = found.margin[:, :, 1]
@@ -217,16 +225,16 @@ def test_an_unstable_plant_fails_whatever_its_margin():
     radius[1, 0, 0] = 1 + 1e-5
     found = certificate(radius=radius)
     assert not found.is_passed and found.fails_from == 2
-    table = tables_of(certificate_report(found, None))["Margins and damping"][0]
+    table = tables_of(certificate_report(found))["Margins and damping"][0]
     assert table["passes"] == ["yes"] * 3 + ["**no**"] + ["yes"] * 2
 
 
 def test_a_certificate_names_the_uncontrolled_mode_that_control_makes_worst():
     """Of existing plants and modes beyond the controlled ones, in the first lines and in JSON."""
     found = certificate()
-    first = text_of(certificate_report(found, None)).partition("**Question:**")[0]
+    first = text_of(certificate_report(found)).partition("**Question:**")[0]
     assert found.spillover is None and "ontrol spillover" not in first
-    assert json.loads(document(found, None))["spillover"] is None
+    assert json.loads(document(found))["spillover"] is None
     zeta = found.damping_ratio.copy()
     zeta[0, 2, 1, 3, 1] = 0.8 * found.free_damping[0, 2, 1, 3, 1]
     zeta[1, 1, 1, 4, 2] = 0.5 * found.free_damping[1, 1, 1, 4, 2]  # the worst
@@ -236,13 +244,13 @@ def test_a_certificate_names_the_uncontrolled_mode_that_control_makes_worst():
     assert (at.mode, at.plant) == (5, found.plants[1, 1, 1])
     assert at.damping_ratio == zeta[1, 1, 1, 4, 2]
     assert at.free_damping == found.free_damping[1, 1, 1, 4, 2]
-    text = text_of(certificate_report(worse, None))
+    text = text_of(certificate_report(worse))
     sentence = (
         f"Control spillover: mode 5, which is not controlled, has a damping ratio of "
         f"{at.damping_ratio:.2g} instead of {at.free_damping:.2g} without control"
     )
     assert sentence in text[: text.index("**Question:**")]
-    kept = json.loads(document(worse, None))["spillover"]
+    kept = json.loads(document(worse))["spillover"]
     assert kept["mode"] == 5 and kept["damping_ratio"] == pytest.approx(at.damping_ratio)
     assert kept["damping_ratio_without_control"] == pytest.approx(at.free_damping)
     assert (kept["basis"], kept["modes"]) == (at.plant.basis, 5)
@@ -253,12 +261,12 @@ def test_a_failed_certificate_says_what_would_pass():
     margin[1, 1, 0] = 1.5
     found = certificate(margin=margin)
     assert verdict(found) == "failed by breaks 8: gain margin 1.5, 2 required"
-    words = text_of(certificate_report(found, None))
+    words = text_of(certificate_report(found))
     assert "with its gains scaled by 0.75 the controller would pass" in words
     assert "`control.gain_factor = 0.3`" in words and "**not safe** on 10 of 11 plants" in words
     margin[1, 1, 0] = 0
-    words = text_of(certificate_report(certificate(margin=margin), None))
-    assert "no gain passes: choose another law" in words
+    words = text_of(certificate_report(certificate(margin=margin)))
+    assert "no gain passes: choose another basis or velocity estimator, or another law" in words
     passed = verdict(certificate())
     at = certificate().worst
     assert passed == (
@@ -268,8 +276,8 @@ def test_a_failed_certificate_says_what_would_pass():
 
 
 def test_a_certificate_s_document_has_every_number():
-    found, laws = certificate(), comparison()
-    data = json.loads(document(found, laws))
+    found = certificate(fast_move=fast_move())
+    data = json.loads(document(found))
     assert data["required_margin"] == 2 and data["is_passed"] and data["fails_from_modes"] is None
     assert data["smallest_margin"] == np.nanmin(found.margin)
     assert data["verdict"] == verdict(found) and data["notes"] == list(found.notes)
@@ -299,20 +307,14 @@ def test_a_certificate_s_document_has_every_number():
             }
         )
     assert data["plants"] == wanted
-    assert data["laws"] == [
-        {
-            "law": name,
-            "factor": laws.factor[k],
-            "damping_ratio": [*laws.damping_ratio[k, :2], None],
-            "gain_margin": laws.margin[k] if k else None,
-            "broken_by": laws.breaking[k],
-            "residual_rms_m": laws.residual_rms[k].tolist(),
-            "peak_voltage_v": laws.peak_voltage[k],
-            "control_energy_v2s": laws.control_energy[k],
-            "run": status.REASONS[laws.status[k]],
-        }
-        for k, name in enumerate(laws.names)
-    ]
+    move = found.fast_move
+    assert data["fast_move"] == {
+        "move_time_s": move.move_time,
+        "residual_rms_m": move.residual_rms[0].tolist(),
+        "residual_rms_without_control_m": move.residual_rms[1].tolist(),
+        "run": "ok",
+        "run_without_control": "ok",
+    }
 
 
 # --- tunings --------------------------------------------------------------------------------------

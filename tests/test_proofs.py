@@ -20,6 +20,7 @@ from studies.engine.controller import fixed_controller
 from studies.engine.stability import gain_margin
 from studies.show.document import schema
 from studies.spillover import ModelMismatch, certify
+from studies.spillover import proofs as proofs_module
 from studies.spillover.plants import (
     LARGEST,
     LoopBuilder,
@@ -41,7 +42,8 @@ from studies.spillover.proofs import (
     prove_box,
     volume,
 )
-from studies.spillover.report import document, report
+from studies.spillover.report import document, report, verdict
+from tests.pages import text_of
 from tests.proofs import ONE_MOVE as STUDY
 from tests.proofs import many_modes_loop, random_design, spectral_radius
 
@@ -303,7 +305,7 @@ def test_statements_say_what_is_proven():
         )
     ]
     assert texts[0].startswith("undecided on 25 % of the box")
-    assert texts[1].startswith("UNSTABLE machine in the box") and "x 0.95, 1 samples" in texts[1]
+    assert texts[1].startswith("UNSTABLE machine in the box") and "x 0.95, 1 sample of" in texts[1]
     assert texts[2].endswith("no bound")
     none = PROVEN._replace(all_modes=AllModes(0.0, 0.19, LARGEST, "no bound"))
     assert proof_texts(none)[0] == "not proven for every number of modes: no bound"
@@ -313,8 +315,86 @@ def test_certificates_hold_their_proofs():
     found = certify(STUDY, sizes=(3,), bases=(SINES,), mismatches=(ModelMismatch(),))
     for proofs in (None, PROVEN):
         found = found._replace(proofs=proofs)
-        data = json.loads(document(found, None))
+        data = json.loads(document(found))
         jsonschema.validate(data, schema("spillover"))
         assert (data["proofs"] is None) == (proofs is None)
-        assert ("Proven: no unstable machine" in report(found, None)) == (proofs is not None)
+        assert ("Proven: no unstable machine" in report(found)) == (proofs is not None)
     assert data["proofs"]["box"]["is_proven"] and data["proofs"]["all_modes"]["gain_margin"] == 3.5
+
+
+def with_box(found, **changes):
+    """A certificate with proofs about a box."""
+    return found._replace(proofs=PROVEN._replace(box=PROVEN.box._replace(**changes)))
+
+
+#: Its plants have a gain margin of 1.5, its delay margin is below one sample.
+LATE = {
+    "electronics__sample_rate_hz": 16e3,
+    "electronics__antialias_hz": 4e3,
+    "control__gain_factor": 2.35,
+}
+
+
+@pytest.fixture(scope="module")
+def near():
+    """A certificate that passes on its plants, and what is known of its box."""
+    study = STUDY.change(**LATE)
+    plants = {"sizes": (3, LARGEST), "bases": (SINES,), "mismatches": (ModelMismatch(),)}
+    other = fixed_controller(study)
+    box = prove_box(other, pad_channels(other.controller, other.n_patches), 20.0)
+    return certify(study, 1.2, **plants), box
+
+
+def test_an_unstable_machine_of_the_box_fails_a_design_whose_plants_pass(near):
+    found, box = near
+    assert found.is_passed and found.unstable_machine is None
+    assert box.unstable == (1.0, 0.5, 0.05)  # the first one tried
+    failed = found._replace(proofs=PROVEN._replace(box=box))
+    assert not failed.is_passed and failed.passes.all() and failed.fails_from == 0
+    machine = "stiffness x 1, 0.5 samples of extra delay, 0.05 kg more payload"
+    assert verdict(failed) == (
+        f"failed by an unstable machine in the box: {machine}; on the plants: gain margin 1.5, "
+        "1.2 required"
+    )
+    data = json.loads(document(failed))
+    jsonschema.validate(data, schema("spillover"))
+    assert not data["is_passed"] and data["verdict"] == verdict(failed)
+    assert data["fails_from_modes"] is None
+    words = " ".join(text_of(report(failed)).split())
+    first = words[: words.index("**Question:**")]
+    assert "certificate failed: unstable machine in the box, gain margin 1.5" in first
+    assert "safe on 2 of 2 plants" in first and "not safe** on" not in first
+    assert f"**Not safe in the box of machines, of which one is unstable: {machine}.**" in first
+    assert "until `--prove` finds no unstable machine" in words and "studies export" not in words
+
+
+def test_an_undecided_box_fails_nothing_and_is_said(near):
+    for changes, said in (
+        ({"undecided": 0.25}, "undecided on 25 % of the box"),
+        ({"undecided": 1.0, "fault": "no bound"}, "nothing proven for stiffness"),
+    ):
+        found = with_box(near[0], **changes)
+        assert found.is_passed and verdict(found).startswith("passed: ")
+        words = " ".join(text_of(report(found)).split())
+        assert f"In the box of machines: {said}" in words[: words.index("**Question:**")]
+
+
+def test_a_verdict_names_plant_and_machine_where_both_fail(near):
+    found = with_box(near[0]._replace(required=2.0), unstable=(1.0, 0.5, 0.05))
+    said = verdict(found)
+    assert said.startswith("failed by ") and "gain margin 1.5, 2 required; unstable machine" in said
+    assert said.endswith("stiffness x 1, 0.5 samples of extra delay, 0.05 kg more payload")
+
+
+def test_an_unstable_machine_of_one_mode_is_not_hidden_by_others(monkeypatch):
+    """Of a law that is judged mode by mode, one of which has no proof."""
+    boxes = [
+        PROVEN.box._replace(undecided=1.0, fault="no bound"),
+        PROVEN.box._replace(undecided=1.0, unstable=(0.95, 1.0, 0.1)),
+        PROVEN.box,
+    ]
+    waiting = iter(boxes)
+    monkeypatch.setattr(proofs_module, "prove_box", lambda *_: next(waiting))
+    monkeypatch.setattr(proofs_module, "prove_all_modes", lambda *_: PROVEN.all_modes)
+    switching = fixed_controller(STUDY.change(control__law="modified_imsc"))
+    assert proofs_module.prove(switching).box == boxes[1]

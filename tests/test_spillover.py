@@ -11,6 +11,7 @@ import pytest
 import scipy.linalg
 import xarray
 
+from jaxmodel import status
 from jaxmodel.channels import strongest
 from jaxmodel.controller import (
     ControllerState,
@@ -24,18 +25,18 @@ from jaxmodel.laws.ppf import HIGHEST_RATIO, design_position_filter
 from studies.engine.breaking import TOLERANCES, BreakingChange, ChangedNumber
 from studies.engine.controller import fixed_controller
 from studies.engine.runs import run_study
-from studies.engine.stability import follow_modes, loop_report, modal_damping
+from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.show.document import schema
-from studies.spillover import ModelMismatch, certify, compare_laws, patch_lengths
+from studies.spillover import ModelMismatch, certify, patch_lengths
 from studies.spillover import run as spillover_run
-from studies.spillover.comparison import _controlled_links, _LawLoops
-from studies.spillover.laws import all_laws
-from studies.spillover.plants import LoopBuilder, PlantVariant, all_plants, pad_channels
+from studies.spillover.fast_move import FAST, WINDOW, make_fast, run_fast_move
+from studies.spillover.plants import LoopBuilder, all_plants, pad_channels
+from studies.spillover.proofs import BOX, AllModes, Proofs, ProvenBox
 from studies.study.cases import as_arrays, build_case, build_structure
-from studies.study.margin import HIGHEST
 from studies.study.spec import paper_study
 from studies.study.template import study_template
+from studies.study.window import residual_delay
 from tests.pages import parsed, text_of
 from tests.test_cli import refused, run
 
@@ -269,29 +270,9 @@ def test_position_filter_is_its_continuous_formula_at_its_own_frequency():
 
 
 @pytest.fixture(scope="module")
-def laws():
-    """All laws of the default design, by name."""
-    found = fixed_controller(STUDY)
-    plant = PlantVariant("pinned_pinned", 8)
-    return {law.law.text: law for law in all_laws(found, LoopBuilder(found), plant)}
-
-
-def test_laws_are_equally_strong_on_mode_1(laws):
-    found = fixed_controller(STUDY)
-    builder, plant = LoopBuilder(found), PlantVariant("pinned_pinned", 8)
-
-    def strength(name):
-        seen, driven = builder.spillover_gains(plant, laws[name].controller)
-        gain = laws[name].controller.feedback.velocity_gain
-        return np.einsum("ic,ic,ic->i", driven[:, 0], gain, seen[:, :, 0])
-
-    own = strength("IMSC")
-    np.testing.assert_allclose(own, 0.5 * np.array([3.1, 3.5, 3.4]), rtol=1e-9)
-    np.testing.assert_allclose(strength("strain rate feedback"), own, rtol=1e-9)
-    # one weight for all links, so only their mean is the design's
-    np.testing.assert_allclose(strength("IMSC-LQR"), own.mean(), rtol=1e-6)
-    push = laws["positive position feedback"].controller.feedback
-    assert np.all(push.position_gain < 0) and not np.any(push.velocity_gain)
+def switching():
+    """Modified IMSC with the default design's gains."""
+    return fixed_controller(STUDY.change(control__law="modified_imsc")).controller
 
 
 def stepped(law, n_samples=40):
@@ -307,8 +288,8 @@ def stepped(law, n_samples=40):
     return np.array(commands), states
 
 
-def test_modified_control_of_one_mode_is_plain_control(laws):
-    law = laws["modified IMSC"].controller
+def test_modified_control_of_one_mode_is_plain_control(switching):
+    law = switching
     one = np.arange(3) == 0
     gain, rival = law.feedback.velocity_gain, law.feedback.rival_omega
     channels = law.feedback._replace(velocity_gain=one * gain, rival_omega=one * rival)
@@ -319,8 +300,8 @@ def test_modified_control_of_one_mode_is_plain_control(laws):
     assert np.abs(found).max() > 0
 
 
-def test_modified_control_acts_on_one_mode_of_a_link_at_a_time(laws):
-    law = laws["modified IMSC"].controller
+def test_modified_control_acts_on_one_mode_of_a_link_at_a_time(switching):
+    law = switching
     commands, _ = stepped(law)
     # as if forces of one column only
     force = np.linalg.solve(np.asarray(law.feedback.synthesizer)[None], commands[..., None])[..., 0]
@@ -338,12 +319,12 @@ def test_the_strongest_is_that_of_highest_energy_and_others_are_no_rivals():
     np.testing.assert_array_equal(strongest(omega, value, rate), wanted)
 
 
-def test_parts_of_the_modified_law_are_its_channels(laws):
-    parts = linear_parts(laws["modified IMSC"].controller)
-    whole = laws["modified IMSC"].controller.feedback.velocity_gain
+def test_parts_of_the_modified_law_are_its_channels(switching):
+    parts = linear_parts(switching)
+    whole = switching.feedback.velocity_gain
     np.testing.assert_allclose(sum(part.feedback.velocity_gain for _, part in parts), whole)
     assert [modes.start for modes, _ in parts] == [0, 1, 2]
-    assert len(linear_parts(laws["IMSC"].controller)) == 1
+    assert len(linear_parts(fixed_controller(STUDY).controller)) == 1
 
 
 def test_idle_channels_change_nothing():
@@ -368,92 +349,31 @@ def test_idle_channels_change_nothing():
     assert isinstance(more, ControllerState) and more.feedback.first.shape == (3, 3)
 
 
-# --- beside each other, and the command -----------------------------------------------------------
+# --- the fast move, and the command ---------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def comparison():
-    return compare_laws(STUDY, sizes=(3,))
+def move():
+    return run_fast_move(STUDY)
 
 
-def test_factors_keep_the_margin_and_the_designs_damping(comparison):
-    names = comparison.names
-    assert names[:2] == ("no control", "baseline") and len(names) == 9
-    given, laws = 1, slice(2, None)
-    assert np.all(comparison.margin[laws] > 2 - 1e-3)
-    zeta = comparison.damping_ratio[:, 0]
-    assert np.all(zeta[laws] < zeta[given] * 1.02)
-    # the design passes here, so it is its own law
-    own = names.index("IMSC")
-    np.testing.assert_allclose(comparison.factor[own], 1, atol=1e-9)
-    for numbers in (comparison.damping_ratio, comparison.margin, comparison.residual_rms):
-        np.testing.assert_allclose(numbers[own], numbers[given], rtol=1e-9)
-    np.testing.assert_allclose(comparison.margin[given], 3.911, atol=2e-3)
-    # optimal gains are nearly alike for all modes, the paper's fall off
-    assert np.all(comparison.damping_ratio[names.index("IMSC-LQR"), 1:] > 2 * 0.01)
+def test_the_fast_move_is_a_run_with_and_without_control(move):
+    for k, study in enumerate((move.study, move.study.uncontrolled())):
+        metrics = run_study(study, has_record=False, has_loop=False).result.metrics
+        np.testing.assert_allclose(
+            move.residual_rms[k], metrics.residual_rms.max(axis=1), rtol=1e-9
+        )
+    assert np.all(move.status == status.OK)
+    assert np.all(move.residual_rms[0] < 0.1 * move.residual_rms[1])
 
 
-def test_control_reduces_vibration_at_the_price_of_voltage(comparison):
-    assert np.all(comparison.status[:2] == 0)
-    off, given = comparison.residual_rms[:2]
-    assert np.all(given < 0.1 * off) and comparison.peak_voltage[0] == 0
-    one = comparison.names.index("modified IMSC")
-    assert np.all(comparison.residual_rms[one] < 0.1 * off)
-    assert comparison.control_energy[one] > 0
-
-
-def test_a_law_given_to_the_run_is_the_law_that_runs(comparison):
-    """The design's coefficients handed over, against a run of its study."""
-    metrics = run_study(comparison.study, has_record=False, has_loop=False).result.metrics
-    given = comparison.names.index("baseline")
-    np.testing.assert_allclose(
-        comparison.residual_rms[given], metrics.residual_rms.max(axis=1), rtol=1e-9
-    )
-    np.testing.assert_allclose(comparison.control_energy[given], metrics.control_energy, rtol=1e-9)
-    np.testing.assert_allclose(
-        comparison.peak_voltage[given], metrics.peak_voltage.max(), rtol=1e-9
-    )
-
-
-def test_laws_need_a_gain_to_be_compared_by():
-    changes = {"control__velocity_gain": (0.0,) * 3, "control__position_gain": (1.0,) * 3}
-    with pytest.raises(StudyError, match="control.velocity_gain = .*damp mode 1"):
-        compare_laws(STUDY.change(**changes), sizes=(3,))
-
-
-@pytest.mark.parametrize(
-    ("changes", "field"),
-    [
-        ({"control__mode_mask": ((False, True, True),) * 3}, "control.velocity_gain"),
-        ({"control__velocity_gain": (3.1, -3.1, 3.1)}, "control.velocity_gain"),
-        ({"control__law": "srf", "control__mode_mask": ((False,) * 3,) * 3}, "control.ratios"),
-        ({"control__law": "srf", "control__ratios": ((0.0,),) * 3}, "control.ratios"),
-    ],
-)
-def test_laws_are_not_compared_by_rounding(changes, field):
-    with pytest.raises(StudyError, match=f"{field} = .*control.mode_mask"):
-        compare_laws(STUDY.change(**changes), sizes=(3,))
-
-
-def test_damping_is_that_of_links_that_control_the_mode():
-    """Mode 1 of link 1 alone: the strongest of its three; link 2 has mode 2, and none mode 3."""
-    mask = ((True, False, False), (False, True, False), (False, False, False))
-    found = fixed_controller(STUDY.change(control__mode_mask=mask))
-    np.testing.assert_array_equal(_controlled_links(found), [1, 1, 2])
-    builder, plant = LoopBuilder(found), PlantVariant("pinned_pinned", 3)
-    law = all_laws(found, builder, plant)[0]
-    view = _LawLoops(found, law, plant, (3,))
-    loop = builder.loop(plant, law.controller)
-    tracked = follow_modes(loop, np.linspace(0.1, 1, 16), loop.poles)[-1]
-    zeta = modal_damping(loop, tracked)[1]
-    np.testing.assert_allclose(view.damping(1.0)[:2], zeta[:2].max(axis=1), rtol=1e-6)
-    assert view.damping(1.0)[0] > 0.2 and view.damping(0.0)[0] < 0.02
-    # as much as the design damps, with no larger gains: beyond its peak damping falls again
-    factor = view.matched_factor(2.0, view.damping(1.0)[0])
-    assert 0.9 < factor <= 1
-    np.testing.assert_allclose(view.damping(factor)[0], view.damping(1.0)[0], rtol=1e-2)
-    # no gains at all leave every margin
-    assert view.margin(0.0) == HIGHEST
+def test_the_fast_move_has_the_acceleration_of_its_own():
+    long = STUDY.change(motion__waypoints=((0.0, 0.0, 0.5), (0.0, 0.02, 0.5), (0.01, 0.0, 0.5)))
+    fast = make_fast(long.change(shaper__kind="zv", motion__dwell=0.1))
+    assert len(fast.motion.waypoints) == 2 and fast.shaper.kind == "none"
+    assert fast.motion.move_time == pytest.approx(FAST[1] * 2**0.5)
+    still = make_fast(STUDY.change(motion__waypoints=STUDY.motion.waypoints[:1]))
+    assert still.run.duration == pytest.approx(residual_delay(still) + WINDOW + 0.01)
 
 
 #: As if it were found; `tests/test_breaking.py` looks for real ones.
@@ -469,14 +389,14 @@ CHANGE = BreakingChange(
 )
 
 
-def few(monkeypatch, comparison):
-    """A command that looks at few plants, and for no change."""
+def few(monkeypatch, move):
+    """A command that looks at few plants, for no change, and has a fast move."""
     monkeypatch.setattr(
         spillover_run, "smallest_change", lambda design, units: CHANGE._replace(tolerances=units)
     )
     chosen = {"bases": ("pinned_pinned",), "mismatches": patch_lengths((0.8, 1.0)), "sizes": (3, 9)}
     monkeypatch.setattr(spillover_run, "certify", partial(certify, **chosen))
-    monkeypatch.setattr(spillover_run, "compare_laws", comparison)
+    monkeypatch.setattr(spillover_run, "run_fast_move", move)
 
 
 def write(folder, **changes):
@@ -485,8 +405,8 @@ def write(folder, **changes):
     return path
 
 
-def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_path, comparison):
-    few(monkeypatch, lambda study, margin: comparison)
+def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_path, move):
+    few(monkeypatch, lambda study: move)
     design, out = write(tmp_path), tmp_path / "deep" / "out"
     code, text, _ = run(
         capsys, "spillover", design, "--out", out, "--pdf", "--tolerance", "patch=5e-4"
@@ -494,24 +414,23 @@ def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_
     assert code == 0 and "passed: gain margin 2.88, 2 required" in text
     assert CHANGE.text in text
     figures = [
-        f"{name}.{kind}"
-        for name in ("margins", "damping", "leakage", "laws")
-        for kind in ("png", "pdf")
+        f"{name}.{kind}" for name in ("margins", "damping", "leakage") for kind in ("png", "pdf")
     ]
     files = {"report.html", "certificate.json", "spillover.h5", *figures}
     assert {path.name for path in out.iterdir()} == files | {"machine.png"}
-    assert (out / "laws.pdf").read_bytes()[:5] == b"%PDF-"
+    assert (out / "damping.pdf").read_bytes()[:5] == b"%PDF-"
     report = text_of((out / "report.html").read_text(encoding="utf-8"))
     assert report.startswith(
         "# Spillover certificate passed: gain margin 2.88 (9.2 dB), 2 required"
     )
-    assert all(f"![{name}]" in report for name in ("margins", "damping", "leakage", "laws"))
-    assert "| modified IMSC |" in report and "Not covered" in report
+    assert all(f"![{name}]" in report for name in ("margins", "damping", "leakage"))
+    assert "studies laws DESIGN" in report and "Not covered" in report
     page = parsed((out / "report.html").read_text())
-    assert len(page.images) == 5 and page.title.startswith("Spillover certificate passed")
+    assert len(page.images) == 4 and page.title.startswith("Spillover certificate passed")
     data = json.loads((out / "certificate.json").read_text())
     jsonschema.validate(data, schema("spillover"))
-    assert data["is_passed"] and len(data["plants"]) == 8 and len(data["laws"]) == 9
+    assert data["is_passed"] and len(data["plants"]) == 8
+    assert data["fast_move"]["residual_rms_m"] == move.residual_rms[0].tolist()
     assert "| delay | 0.5 samples late | +2.00 |" in report and "patch 0.0005 m," in report
     assert data["smallest_change"] == CHANGE.record() | {
         "changes": [part._asdict() for part in CHANGE.parts],
@@ -521,11 +440,11 @@ def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_
     with xarray.open_dataset(out / "spillover.h5") as store:
         margin = store.gain_margin.sel(basis="pinned_pinned", plant_modes=9)
         assert float(margin.min()) == pytest.approx(data["smallest_margin"])
-        assert store.law.values.tolist() == list(comparison.names)
+        np.testing.assert_array_equal(store.residual_rms.sel(control="off"), move.residual_rms[1])
 
 
-def test_another_design_s_certificate_is_left_alone(capsys, monkeypatch, tmp_path, comparison):
-    few(monkeypatch, lambda study, margin: comparison)
+def test_another_design_s_certificate_is_left_alone(capsys, monkeypatch, tmp_path, move):
+    few(monkeypatch, lambda study: move)
     out = tmp_path / "out"
     out.mkdir()
     kept = json.dumps({"study": STUDY.change(control__gain_factor=0.1).model_dump(mode="json")})
@@ -535,9 +454,9 @@ def test_another_design_s_certificate_is_left_alone(capsys, monkeypatch, tmp_pat
     assert (out / "certificate.json").read_text() == kept
 
 
-def test_a_certificate_is_made_again_in_its_folder(capsys, monkeypatch, tmp_path, comparison):
+def test_a_certificate_is_made_again_in_its_folder(capsys, monkeypatch, tmp_path, move):
     """Also that of a design whose ratios come from its own run and are written as numbers."""
-    few(monkeypatch, lambda study, margin: comparison)
+    few(monkeypatch, lambda study: move)
     monkeypatch.setattr(
         spillover_run.figures,
         "save",
@@ -550,7 +469,7 @@ def test_a_certificate_is_made_again_in_its_folder(capsys, monkeypatch, tmp_path
 
 
 def test_command_fails_a_design(capsys, monkeypatch, tmp_path):
-    def refuse(study, margin):
+    def refuse(study):
         raise StudyError("not today")
 
     few(monkeypatch, refuse)
@@ -562,19 +481,39 @@ def test_command_fails_a_design(capsys, monkeypatch, tmp_path):
     design, out = write(tmp_path, **DIFFERENCE), tmp_path / "out"
     code, text, _ = run(capsys, "spillover", design, "--out", out, "--margin", "1.5")
     assert code == 1 and "failed by mode" in text and "unstable" in text
-    assert "laws are not compared: not today" in text
+    assert "no fast move: not today" in text
     report = text_of((out / "report.html").read_text(encoding="utf-8"))
     assert (
-        report.startswith("# Spillover certificate failed: gain margin") and "## Laws" not in report
+        report.startswith("# Spillover certificate failed: gain margin")
+        and "## The fast move" not in report
     )
-    assert "| **no** |" in report and "- laws are not compared: not today" in report
+    assert "| **no** |" in report and "- no fast move: not today" in report
     data = json.loads((out / "certificate.json").read_text())
     jsonschema.validate(data, schema("spillover"))
     assert not data["is_passed"]
 
 
-def test_a_certificate_is_written_whole_or_not_at_all(capsys, monkeypatch, tmp_path, comparison):
-    few(monkeypatch, lambda study, margin: comparison)
+def test_command_fails_a_design_with_an_unstable_machine_in_its_box(
+    capsys, monkeypatch, tmp_path, move
+):
+    few(monkeypatch, lambda study: move)
+    box = ProvenBox(BOX, 1.0, True, 12, cells=0, seconds=0.0, unstable=(0.95, 1.0, 0.1))
+    monkeypatch.setattr(spillover_run, "prove", lambda _: Proofs(AllModes(3.5, 3.7, 12), box))
+    monkeypatch.setattr(
+        spillover_run.figures,
+        "save",
+        lambda _, out, name, __: (out / f"{name}.png").write_bytes(b"-"),
+    )
+    out = tmp_path / "out"
+    code, text, _ = run(capsys, "spillover", write(tmp_path), "--out", out, "--prove")
+    assert code == 1 and "passed" not in text
+    wanted = "failed by an unstable machine in the box: stiffness x 0.95, 1 sample of extra delay"
+    assert wanted in text and "on the plants: gain margin 2.88, 2 required" in text
+    assert not json.loads((out / "certificate.json").read_text())["is_passed"]
+
+
+def test_a_certificate_is_written_whole_or_not_at_all(capsys, monkeypatch, tmp_path, move):
+    few(monkeypatch, lambda study: move)
     monkeypatch.setattr(
         spillover_run.figures,
         "save",

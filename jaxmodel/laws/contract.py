@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal, NamedTuple, get_args
 
-from jaxmodel.case import Case, Control, Structure
+from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.control import force_gains
 from jaxmodel.controller import Feedback
@@ -55,9 +55,6 @@ class Law(NamedTuple):
     places_poles: bool = False
     # the channels of a link act one at a time, so each is judged by itself
     is_switching: bool = False
-    # settings with which it damps mode 1 as much as modal control does with the case's settings;
-    # None: its velocity gains are scaled to match
-    as_strong: Callable[[Case, NominalModel], Control] | None = None
 
 
 def check_law(law: Law) -> None:
@@ -125,26 +122,6 @@ def study_gains(case: Case, nominal: NominalModel) -> tuple[Array, Array]:
         for first in (control.velocity_gain, control.position_gain)
     )
     return velocity, position
-
-
-def as_modal(control: Control, velocity: Array, position: Array) -> Control:
-    """Settings of modal control that give these gains, (3, C) each [N s/m], [N/m].
-
-    Position gains must be the same multiple of velocity gains for all modes of a link.
-    """
-    is_on = velocity != 0
-    share = jnp.where(is_on, position / jnp.where(is_on, velocity, 1.0), 0.0)
-    largest = jnp.argmax(jnp.abs(share), axis=1)
-    return control._replace(
-        velocity_gain=jnp.ones((3,)),
-        position_gain=jnp.take_along_axis(share, largest[:, None], axis=1)[:, 0],
-        ratio=velocity,
-        gain_factor=jnp.ones(()),
-        is_per_mass=jnp.zeros(()),
-        mode_mask=is_on.astype(velocity.dtype),
-        damping=-jnp.ones_like(velocity),
-        pole_decay=jnp.zeros_like(velocity),
-    )
 
 
 def study_estimator(case: Case, nominal: NominalModel) -> Estimator:

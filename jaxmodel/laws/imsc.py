@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from jaxmodel.case import Case, Control, Structure
+from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.laws.contract import Law, NominalModel, modal_feedback
 from jaxmodel.laws.poles import modal_gains
@@ -13,9 +13,4 @@ def design(structure: Structure, case: Case, nominal: NominalModel) -> Channels:
     return modal_feedback(case, nominal, *modal_gains(structure, case, nominal))
 
 
-def same(case: Case, nominal: NominalModel) -> Control:
-    """Settings of modal control itself."""
-    return case.control
-
-
-IMSC = Law("imsc", "IMSC", "mode", design, has_position=False, places_poles=True, as_strong=same)
+IMSC = Law("imsc", "IMSC", "mode", design, has_position=False, places_poles=True)

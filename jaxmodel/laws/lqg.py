@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from jaxmodel.case import Case, Control, Structure
+from jaxmodel.case import Case, Structure
 from jaxmodel.laws.bending import BENDING, bent, walk
-from jaxmodel.laws.contract import Law, NominalModel, study_gains
+from jaxmodel.laws.contract import Law, NominalModel
 from jaxmodel.laws.link_model import DAMPING, LinkModel, compensated, link_model
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
@@ -40,45 +40,20 @@ def design(structure: Structure, case: Case, nominal: NominalModel) -> StateSpac
     return compensated(structure, case, wide.model, gain, correction)
 
 
-def as_strong(case: Case, nominal: NominalModel) -> Control:
-    """A weight for each link that gives mode 1 the damping of modal control, and its modes.
-
-    For small gains, without delay, the optimal decay of a mode that is moved by b per volt is
-    |b|/sqrt(2 R m): with k_d = 2 m decay, R = 2 m |b|^2/k_d^2.
-    """
-    velocity = case.control.gain_factor * study_gains(case, nominal)[0]
-    is_on = velocity != 0
-    first = jnp.argmax(jnp.any(is_on, axis=0))
-    gain, mass = velocity[:, first], nominal.modal_mass[:, first]
-    push = jnp.sum(nominal.actuator[:, first] ** 2, axis=1)
-    chosen = gain != 0
-    weight = 2 * mass * push / jnp.where(chosen, gain, 1.0) ** 2
-    own = case.control.parameters
-    return case.control._replace(
-        parameters=own | {"voltage_weight": jnp.where(chosen, weight, WEIGHT.high)},
-        link_mask=jnp.asarray(case.control.link_mask) * jnp.any(is_on, axis=1),
-        mode_mask=is_on.astype(nominal.omega.dtype),
-        gain_factor=jnp.ones(()),
-    )
-
-
-#: Field of the regulator.
-WEIGHT = Parameter(
-    "voltage_weight",
-    3e-8,
-    "J/V2",
-    "weight of the squared voltages against the modes' energy",
-    1e-14,
-    1e-2,
-)
-
 LQG = Law(
     "lqg",
     "LQG",
     "none",
     design,
     parameters=(
-        WEIGHT,
+        Parameter(
+            "voltage_weight",
+            3e-8,
+            "J/V2",
+            "weight of the squared voltages against the modes' energy",
+            1e-14,
+            1e-2,
+        ),
         Parameter(
             "disturbance",
             3e-4,
@@ -94,5 +69,4 @@ LQG = Law(
         DAMPING,
     ),
     has_position=False,
-    as_strong=as_strong,
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from jaxmodel.case import Case, Control, Structure
+from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.control import PoleGains
 from jaxmodel.laws.contract import (
@@ -10,7 +10,6 @@ from jaxmodel.laws.contract import (
     NominalModel,
     acting_channels,
     modal_feedback,
-    study_gains,
 )
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
@@ -44,26 +43,6 @@ def design(structure: Structure, case: Case, nominal: NominalModel) -> Channels:
     return modal_feedback(case, nominal, scale * gains.velocity, scale * gains.position)
 
 
-def as_strong(case: Case, nominal: NominalModel) -> Control:
-    """One weight for all links that gives the first mode the k_d of modal control, and its modes.
-
-    From k_d^2 = 2 k_p + 1/R: 1/R = h (h - 2 omega) with h^2 = k_d^2 + 4 omega^2.
-    """
-    velocity = case.control.gain_factor * study_gains(case, nominal)[0]
-    is_on = velocity != 0
-    first = jnp.argmax(jnp.any(is_on, axis=0))
-    chosen = is_on[:, first]
-    count = jnp.maximum(jnp.sum(chosen), 1)
-    gain = jnp.sum(jnp.where(chosen, (velocity / nominal.modal_mass)[:, first], 0.0)) / count
-    at = jnp.sum(jnp.where(chosen, nominal.omega[:, first], 0.0)) / count
-    weight = (1 + 2 * at / jnp.hypot(gain, 2 * at)) / gain**2
-    return case.control._replace(
-        parameters={"control_weight": jnp.full((3,), weight)},
-        mode_mask=is_on.astype(nominal.omega.dtype),
-        gain_factor=jnp.ones(()),
-    )
-
-
 LQR = Law(
     "lqr",
     "IMSC-LQR",
@@ -79,5 +58,4 @@ LQR = Law(
             1e3,
         ),
     ),
-    as_strong=as_strong,
 )

@@ -9,7 +9,6 @@ from __future__ import annotations
 from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.laws.contract import Law, NominalModel, modal_feedback
-from jaxmodel.laws.imsc import same
 from jaxmodel.laws.poles import modal_gains
 from jaxmodel.lazy import jnp
 
@@ -30,5 +29,4 @@ MODIFIED_IMSC = Law(
     has_position=False,
     places_poles=True,
     is_switching=True,
-    as_strong=same,
 )

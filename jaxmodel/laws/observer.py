@@ -14,7 +14,6 @@ from functools import reduce
 from jaxmodel.case import Case, Structure
 from jaxmodel.laws.bending import BENDING, bent, force_decay
 from jaxmodel.laws.contract import Law, NominalModel, acting_channels
-from jaxmodel.laws.imsc import same
 from jaxmodel.laws.link_model import (
     DAMPING,
     LinkModel,
@@ -166,5 +165,4 @@ OBSERVER = Law(
         BENDING,
         DAMPING,
     ),
-    as_strong=same,
 )

@@ -15,7 +15,6 @@ from jaxmodel.channels import Channels
 from jaxmodel.electronics import measurement_chain
 from jaxmodel.estimator import Estimator, second_order
 from jaxmodel.laws.contract import Law, NominalModel, modal_feedback, study_gains
-from jaxmodel.laws.imsc import same
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 from jaxmodel.table import Parameter
@@ -93,5 +92,4 @@ PPF = Law(
     parameters=(
         Parameter("filter_damping", 0.5, "1", "zeta_f, damping ratio of the filters", 0.01, 2.0),
     ),
-    as_strong=same,
 )

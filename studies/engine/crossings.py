@@ -198,19 +198,32 @@ def _at_levels(
         found.append(places.chosen(_is_in(is_mixed, places)))
     places = _looked_again(loops, _joined(found))
     part, period = loops.part(places.loop), loops.plant.period[places.loop]
-    after = part.at_delay(places.omega[:, None], places.level[:, None] + SLIGHT)[:, 0]
-    value = np.exp(places.log)
-    later = -np.linalg.eigvals(after)
-    best = np.abs(later - value[:, None]).argmin(axis=1)[:, None]
-    rate = np.angle(np.take_along_axis(later, best, axis=1)[:, 0] / value) / SLIGHT
-    rate = np.where(np.abs(rate) < 1e-3, 1e-3, rate)
+    # both at the same frequency: between the grid's, where places lie, angles are not exact
+    now, later = (
+        -np.linalg.eigvals(part.at_delay(places.omega[:, None], places.level[:, None] + more)[:, 0])
+        for more in (0.0, SLIGHT)
+    )
+    now = _nearest(now, np.exp(places.log))
+    rate = np.log(_nearest(later, now) / now) / SLIGHT
     angle = places.log.imag[:, None] - (places.omega * period)[:, None] * whole
-    shift = -((angle + np.pi) % (2 * np.pi) - np.pi) / rate[:, None]
+    angle = (angle + np.pi) % (2 * np.pi) - np.pi
+    slope = places.slope[:, None] - 1j * period[:, None] * whole
+    # later images also change the modulus, so where it is 1 moves along the axis
+    moved = -rate.real[:, None] / np.where(slope.real == 0, 1e-300, slope.real)
+    along = rate.imag[:, None] + slope.imag * moved
+    shift = -angle / np.where(np.abs(along) < 1e-3, 1e-3, along)
     delay = places.level[:, None] + whole + shift
     row, late = np.nonzero((np.abs(shift) < 1 / LEVELS) & (delay > 0))
     chosen = places.chosen(row)
-    chosen = chosen._replace(slope=chosen.slope - 1j * period[row] * whole[late])
-    return chosen, delay[row, late], 1j * rate[row]
+    omega = chosen.omega + moved[row, late] * shift[row, late]
+    chosen = chosen._replace(omega=omega, slope=slope[row, late])
+    return chosen, delay[row, late], rate[row]
+
+
+def _nearest(candidates: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Of each row of candidates (p, m) the one nearest to its value, (p,)."""
+    best = np.abs(candidates - value[:, None]).argmin(axis=1)[:, None]
+    return np.take_along_axis(candidates, best, axis=1)[:, 0]
 
 
 def _smallest(
@@ -267,5 +280,4 @@ def _smallest(
 
 def _nearest_log(eigenvalue: np.ndarray) -> np.ndarray:
     """Logarithm of -eigenvalue for the one nearest to -1, (p,)."""
-    best = np.abs(eigenvalue + 1).argmin(axis=1)[:, None]
-    return np.log(-np.take_along_axis(eigenvalue, best, axis=1)[:, 0])
+    return np.log(-_nearest(eigenvalue, np.full(len(eigenvalue), -1.0)))

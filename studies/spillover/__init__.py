@@ -1,9 +1,8 @@
-"""Spillover: a controller on plants with modes it does not know, and a comparison of laws.
+"""Spillover: a controller on plants with modes it does not know.
 
 - `plants` defines the plants and their linearised loops, `certificate` judges them:
-  `certify(study)`.
-- `laws` are control laws of equal strength, `comparison` judges and runs them:
-  `compare_laws(study)`.
+  `certify(study)`; `proofs` is about what lies between and beyond them.
+- `fast_move` runs the nominal machine with and without the controller.
 - `report`, `plots` and `run` write everything into a folder, `commands` is `studies spillover`.
 """
 

@@ -16,6 +16,7 @@ from studies.engine.host_loop import SampledLoop, name_motion
 from studies.engine.stability import LoopFigures, judge_loop, worst_figures
 from studies.errors import StudyError, field_error
 from studies.publish import shown
+from studies.spillover.fast_move import ControlEffect
 from studies.spillover.plants import (
     MISMATCHES,
     LoopBuilder,
@@ -68,6 +69,7 @@ class Certificate(NamedTuple):
     notes: tuple[str, ...]  # what was left out, and why
     proofs: Proofs | None = None  # beyond these plants, if they were asked for
     smallest_change: BreakingChange | None = None  # that breaks the design; None: not looked for
+    fast_move: ControlEffect | None = None  # of the nominal machine; None: not run
 
     def _repr_html_(self) -> str:
         return shown(self)
@@ -86,8 +88,16 @@ class Certificate(NamedTuple):
 
     @property
     def is_passed(self) -> bool:
-        """Whether all of them do."""
-        return bool(self.passes[self.exists].all())
+        """Whether all of them do, and proofs found no unstable machine.
+
+        What proofs leave undecided does not fail a design.
+        """
+        return bool(self.passes[self.exists].all()) and self.unstable_machine is None
+
+    @property
+    def unstable_machine(self) -> tuple[float, float, float] | None:
+        """The one that proofs found: factor on stiffness [1], delay [samples], payload [kg]."""
+        return None if self.proofs is None else self.proofs.box.unstable
 
     @property
     def spillover(self) -> Spillover | None:

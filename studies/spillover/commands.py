@@ -33,7 +33,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             bool,
             typer.Option(
                 "--prove",
-                help="also prove stability for every number of modes and a box of machines",
+                help="also prove stability for every number of modes and a box of machines; an "
+                "unstable machine of the box fails the design",
             ),
         ] = False,
         tolerance: Tolerance = None,

@@ -1,4 +1,4 @@
-"""Figures of a spillover certificate and of the comparison of laws."""
+"""Figures of a spillover certificate."""
 
 from __future__ import annotations
 
@@ -11,12 +11,8 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
-from jaxmodel import status
 from studies.show import figures
 from studies.spillover.certificate import Certificate
-from studies.spillover.comparison import WITHOUT, Comparison
-from studies.study.labels import describe
-from studies.study.margin import margin_text
 
 #: Spillover above this has its own colour [1].
 FLOOR = 0.01
@@ -174,41 +170,3 @@ def leakage(certificate: Certificate) -> Figure:
         for ax in axes[:-1, 0]:
             ax.set_xlabel("")
     return figure
-
-
-def law_bars(comparison: Comparison, ax: Axes | None = None) -> Axes:
-    """Residual vibration of each law on the fast move, with its margin and voltage.
-
-    Args:
-        comparison: from `compare_laws`.
-        ax: where to draw; default: a new figure.
-    """
-    ax = figures.axes_or_new(ax)
-    rows = np.arange(len(comparison.names))
-    height = 0.25
-    for i in range(3):
-        ax.barh(
-            rows + (i - 1) * height,
-            1e6 * comparison.residual_rms[:, i],
-            height,
-            color=figures.SERIES[i],
-            label=f"link {i + 1}",
-        )
-    most = 1e6 * np.nanmax(comparison.residual_rms)
-    for k, name in enumerate(comparison.names):
-        if name == WITHOUT:
-            continue
-        margin = margin_text(comparison.margin[k], 3)
-        end = 1e6 * np.nanmax(comparison.residual_rms[k], initial=0.0)
-        text = f"margin {margin}, peak {comparison.peak_voltage[k]:.3g} V"
-        text = text if comparison.margin[k] > 0 else "no stable gains"
-        if comparison.status[k] != status.OK:
-            text += f"; {describe(int(comparison.status[k]))}"
-        ax.text(end + 0.01 * most, k, text, va="center", fontsize=figures.SMALL)
-    ax.set_yticks(rows, comparison.names)
-    ax.invert_yaxis()
-    ax.margins(x=0.32)
-    ax.grid(axis="y", visible=False)
-    ax.set_xlabel("residual rms of the chord deflection, worst station [µm]")
-    figures.legend_beside(ax)
-    return ax

@@ -98,6 +98,20 @@ def proof_texts(proofs: Proofs) -> tuple[str, str]:
     return first, _box_text(proofs.box)
 
 
+def machine_text(machine: tuple[float, float, float]) -> str:
+    """A machine of the box in words.
+
+    Args:
+        machine: factor on the links' stiffness [1], extra delay [samples], more payload [kg].
+    """
+    stiffness, delay, payload = machine
+    samples = "sample" if delay == 1 else "samples"
+    return (
+        f"stiffness x {stiffness:.4g}, {delay:.3g} {samples} of extra delay, {payload:.3g} kg "
+        "more payload"
+    )
+
+
 def _box_text(box: ProvenBox) -> str:
     (low, high), (_, delay), (_, payload) = box.ranges
     what = (
@@ -112,11 +126,7 @@ def _box_text(box: ProvenBox) -> str:
     if box.fault:
         return f"nothing proven for {what}: {box.fault}"
     if box.unstable is not None:
-        e, d, m = box.unstable
-        return (
-            f"UNSTABLE machine in the box ({what}): stiffness x {e:.4g}, {d:.3g} samples of extra "
-            f"delay, {m:.3g} kg more payload"
-        )
+        return f"UNSTABLE machine in the box ({what}): {machine_text(box.unstable)}"
     if box.is_proven:
         return f"proven: no unstable machine for {what} ({modes})"
     share = max(100 * box.undecided, 1e-3)
@@ -138,7 +148,7 @@ def prove(design: FixedController, seconds: float = 60.0) -> Proofs:
 
 
 def _weakness(box: ProvenBox) -> tuple[bool, bool, float]:
-    return bool(box.fault), box.unstable is not None, box.undecided
+    return box.unstable is not None, bool(box.fault), box.undecided
 
 
 def prove_all_modes(design: FixedController, law: Controller) -> AllModes:

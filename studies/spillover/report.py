@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from jaxmodel import status
 from jaxmodel.laws import LAWS
-from jaxmodel.laws.state_space import STATE_SPACE
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 from studies.engine.breaking import UNITS
 from studies.show.document import json_text
 from studies.show.pages import page
 from studies.show.sketch import CAPTION
 from studies.spillover.certificate import Certificate, Spillover
-from studies.spillover.comparison import FAST, GIVEN, SHOWN, WINDOW, WITHOUT, Comparison
+from studies.spillover.fast_move import FAST, WINDOW, ControlEffect
 from studies.spillover.plants import PlantVariant
-from studies.spillover.proofs import Proofs, proof_texts
+from studies.spillover.proofs import Proofs, machine_text, proof_texts
 from studies.study.labels import describe
 from studies.study.margin import margin_text
 from studies.study.window import residual_delay
@@ -28,14 +28,20 @@ TINY = 1e-9
 
 
 def verdict(certificate: Certificate) -> str:
-    """One line: passed or failed, and the deciding plant."""
-    at = certificate.worst
-    margin, breaking = margin_text(certificate.margin[at], 3), certificate.breaking[at]
+    """One line: passed or failed, and the deciding plant or machine."""
+    at, machine = certificate.worst, certificate.unstable_machine
+    breaking = certificate.breaking[at]
+    margin = (
+        f"gain margin {margin_text(certificate.margin[at], 3)}, {certificate.required:g} required"
+    )
     if certificate.is_passed:
         first = f"; first to go unstable beyond it: {breaking}" if breaking else ""
-        return f"passed: gain margin {margin}, {certificate.required:g} required{first}"
+        return f"passed: {margin}{first}"
+    unstable = "" if machine is None else f"unstable machine in the box: {machine_text(machine)}"
+    if certificate.fails_from == 0:
+        return f"failed by an {unstable}; on the plants: {margin}"
     state = "" if certificate.radius[at] <= 1 + RADIUS_TOLERANCE else "unstable, "
-    return f"failed by {breaking}: {state}gain margin {margin}, {certificate.required:g} required"
+    return f"failed by {breaking}: {state}{margin}{unstable and f'; {unstable}'}"
 
 
 def spillover_text(certificate: Certificate) -> str:
@@ -64,12 +70,40 @@ def damping_text(certificate: Certificate) -> str:
     )
 
 
-def report(certificate: Certificate, laws: Comparison | None, images: Path | None = None) -> str:
+def residual_text(certificate: Certificate) -> str:
+    """What control leaves of the fast move's vibration, in a sentence; "" if there is no move."""
+    move = certificate.fast_move
+    if move is None:
+        return ""
+    lost = [
+        f"{how} control: {describe(int(code))}"
+        for how, code in zip(("with", "without"), move.status, strict=True)
+        if code != status.OK
+    ]
+    last = f" (run {', '.join(lost)})" if lost else ""
+    controlled, free = move.worst
+    if not np.isfinite(move.worst).all():
+        return f"residual vibration on the nominal machine: no figure{last}"
+    change = f", {100 * (controlled / free - 1):+.3g} %" if free > 0 else ""
+    effect = "CONTROL MAKES IT WORSE: " if controlled > free else ""
+    return (
+        f"{effect}residual vibration on the nominal machine{_after(move.move_time)}: "
+        f"{1e6 * controlled:.4g} µm rms on its worst link, {1e6 * free:.4g} without control"
+        f"{change}{last}"
+    )
+
+
+def _after(move_time: float | None) -> str:
+    if move_time is None:
+        return ""
+    return f" after a first move in {1e3 * move_time:.4g} ms without shaper"
+
+
+def report(certificate: Certificate, images: Path | None = None) -> str:
     """The page of a certificate.
 
     Args:
         certificate: from `certify`.
-        laws: comparison of laws, if they can be compared.
         images: folder with the figures; None: a page without.
     """
     study, margin = certificate.study, float(certificate.margin[certificate.worst])
@@ -80,15 +114,15 @@ def report(certificate: Certificate, laws: Comparison | None, images: Path | Non
         certificate=certificate,
         study=study,
         law=LAWS[study.control.law],
-        laws=laws,
         breaking=certificate.breaking[certificate.worst],
-        residual=_residual(laws) if laws is not None else None,
+        residual=residual_text(certificate),
         spillover=spillover_text(certificate),
         change=certificate.smallest_change,
         units=UNITS._asdict(),
         change_rows=_changes(certificate),
         damping=damping_text(certificate),
         proofs=proof_texts(certificate.proofs) if certificate.proofs is not None else (),
+        machine=machine_text(certificate.unstable_machine) if certificate.unstable_machine else "",
         margin=margin,
         worst=certificate.plants[certificate.worst],
         share=margin / certificate.required,
@@ -100,23 +134,13 @@ def report(certificate: Certificate, laws: Comparison | None, images: Path | Non
         free_damping=_free_damping(certificate),
         margins=_margins(certificate),
         leakage=_leakage(certificate),
-        given=GIVEN,
+        move=certificate.fast_move,
+        move_rows=_fast_rows(certificate.fast_move) if certificate.fast_move else [],
         fast=FAST,
-        delay=residual_delay(laws.study) if laws is not None else None,
+        delay=residual_delay(certificate.fast_move.study) if certificate.fast_move else None,
         window=WINDOW,
-        law_modes=[f"zeta {j + 1}" for j in range(SHOWN)],
-        law_rows=_laws(laws) if laws is not None else [],
-        has_system=laws is not None and STATE_SPACE.text in laws.names,
         sketch_caption=CAPTION,
     )
-
-
-def _residual(laws: Comparison) -> tuple[float, float] | None:
-    """Residual of the design and without control, worst links [m]; None if a run failed."""
-    with_it, without = (
-        float(np.max(laws.residual_rms[laws.names.index(x)])) for x in (GIVEN, WITHOUT)
-    )
-    return (with_it, without) if np.isfinite(with_it) and without > 0 else None
 
 
 def _free_damping(certificate: Certificate) -> list[float]:
@@ -194,27 +218,15 @@ def _largest(certificate: Certificate, leakage: np.ndarray) -> dict[str, Any]:
     return {"size": size.max(), "mode": mode, "controlled": int(j) + 1, "plant": plant}
 
 
-def _laws(laws: Comparison) -> list[list[str]]:
-    """Row of each law."""
-    off = laws.residual_rms[laws.names.index(WITHOUT)]
+def _fast_rows(move: ControlEffect) -> list[list[str]]:
+    """Row of each run."""
     return [
-        [
-            name,
-            f"{laws.factor[k]:.3g}",
-            *(f"{zeta:.3g}" if np.isfinite(zeta) else "-" for zeta in laws.damping_ratio[k]),
-            margin_text(laws.margin[k], 3) if np.isfinite(laws.margin[k]) else "-",
-            laws.breaking[k] or "-",
-            " / ".join(f"{1e6 * x:.3g}" for x in laws.residual_rms[k]),
-            f"{100 * np.mean(laws.residual_rms[k] / off):.3g} %" if np.all(off > 0) else "-",
-            f"{laws.peak_voltage[k]:.3g}",
-            f"{laws.control_energy[k]:.3g}",
-            describe(int(laws.status[k])),
-        ]
-        for k, name in enumerate(laws.names)
+        [how, " / ".join(f"{1e6 * x:.3g}" for x in rms), describe(int(code))]
+        for how, rms, code in zip(("on", "off"), move.residual_rms, move.status, strict=True)
     ]
 
 
-def document(certificate: Certificate, laws: Comparison | None) -> str:
+def document(certificate: Certificate) -> str:
     """JSON text: the verdict and every number, null if there is none."""
     whole: dict[str, Any] = {
         "title": certificate.study.title,
@@ -228,10 +240,10 @@ def document(certificate: Certificate, laws: Comparison | None) -> str:
         "plants": [_plant(certificate, tuple(at)) for at in np.argwhere(certificate.exists)],
         "proofs": certificate.proofs and _proofs(certificate.proofs),
         "smallest_change": certificate.smallest_change and certificate.smallest_change.record(),
-        "laws": [] if laws is None else [_law(laws, k) for k in range(len(laws.names))],
+        "fast_move": certificate.fast_move and _fast_move(certificate.fast_move),
         "study": certificate.study.model_dump(mode="json"),
     }
-    return json_text("spillover", whole, version=2)
+    return json_text("spillover", whole, version=3)
 
 
 def _proofs(proofs: Proofs) -> dict[str, Any]:
@@ -260,6 +272,16 @@ def _proofs(proofs: Proofs) -> dict[str, Any]:
             "unstable": unstable,
             "fault": box.fault,
         },
+    }
+
+
+def _fast_move(move: ControlEffect) -> dict[str, Any]:
+    return {
+        "move_time_s": move.move_time,
+        "residual_rms_m": move.residual_rms[0],
+        "residual_rms_without_control_m": move.residual_rms[1],
+        "run": describe(int(move.status[0])),
+        "run_without_control": describe(int(move.status[1])),
     }
 
 
@@ -298,17 +320,3 @@ def _joint(certificate: Certificate, plant: PlantVariant) -> Any:
     """True J_C [kg m2], one for all links or three."""
     joint_inertia = plant.mismatch.joint_inertia
     return certificate.study.link.joint_inertia_c if joint_inertia is None else joint_inertia
-
-
-def _law(laws: Comparison, k: int) -> dict[str, Any]:
-    return {
-        "law": laws.names[k],
-        "factor": laws.factor[k],
-        "damping_ratio": laws.damping_ratio[k],
-        "gain_margin": laws.margin[k],
-        "broken_by": laws.breaking[k],
-        "residual_rms_m": laws.residual_rms[k],
-        "peak_voltage_v": laws.peak_voltage[k],
-        "control_energy_v2s": laws.control_energy[k],
-        "run": describe(int(laws.status[k])),
-    }

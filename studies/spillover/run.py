@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -24,15 +22,22 @@ from studies.show import figures
 from studies.show.sketch import sketch
 from studies.spillover import plots
 from studies.spillover.certificate import Certificate, certify
-from studies.spillover.comparison import Comparison, compare_laws
+from studies.spillover.fast_move import run_fast_move
 from studies.spillover.proofs import proof_texts, prove
-from studies.spillover.report import damping_text, document, report, spillover_text, verdict
+from studies.spillover.report import (
+    damping_text,
+    document,
+    report,
+    residual_text,
+    spillover_text,
+    verdict,
+)
 from studies.store import Variable, write_store
 from studies.study.labels import STATUS_LABEL
 from studies.study.spec import Study
 
 DOCUMENT, DATA = "certificate.json", "spillover.h5"
-PHASES = ("judge", "smallest change", "compare laws", "draw")
+PHASES = ("judge", "smallest change", "fast move", "draw")
 
 
 def spillover_design(
@@ -44,7 +49,7 @@ def spillover_design(
     has_proofs: bool = False,
     tolerances: MachineChange = TOLERANCES,
 ) -> Certificate:
-    """Write the certificate of a design, and the comparison of laws on its machine.
+    """Write the certificate of a design.
 
     Args:
         design: what to judge.
@@ -57,7 +62,8 @@ def spillover_design(
         tolerances: units of the smallest change that breaks it, see `smallest_change`.
 
     Returns:
-        the certificate; `is_passed`: whether the design passes.
+        the certificate; `is_passed`: whether the design passes on every plant, and proofs found no
+        unstable machine.
 
     Raises:
         StudyError: as `certify`, or a folder that cannot be written to.
@@ -70,33 +76,25 @@ def spillover_design(
     with Phases(console, names) as phases:
         phases.begin("judge", "the controller on plants that differ from its nominal model")
         certificate = certify(study, margin)
-        console.print(verdict(certificate), soft_wrap=True)
-        for text in filter(None, (damping_text(certificate), spillover_text(certificate))):
-            console.print(text, soft_wrap=True)
         if has_proofs:
             phases.begin("prove", "every number of modes, and a box of machines")
-            proofs = prove(fixed_controller(study))
-            certificate = certificate._replace(proofs=proofs)
-            for text in proof_texts(proofs):
-                console.print(text, soft_wrap=True)
+            certificate = certificate._replace(proofs=prove(fixed_controller(study)))
+        for text in _statements(certificate):
+            console.print(text, soft_wrap=True)
         phases.begin("smallest change", "of the machine that breaks the design")
         change = smallest_change(fixed_controller(certificate.study), tolerances)
         certificate = certificate._replace(smallest_change=change)
         console.print(change.text, soft_wrap=True)
-        phases.begin("compare laws")
-        laws = None
-        try:
-            laws = compare_laws(certificate.study, margin)
-        except StudyError as error:
-            certificate = certificate._replace(
-                notes=(*certificate.notes, f"laws are not compared: {error}")
-            )
+        phases.begin("fast move", "of the nominal machine, with and without control")
+        certificate = _with_fast_move(certificate)
+        if residual := residual_text(certificate):
+            console.print(residual, soft_wrap=True)
         phases.begin("draw")
         with publish(out) as staging:
-            _draw(staging, certificate, laws, has_pdf)
-            write_store(staging / DATA, variables(certificate, laws), run_attributes(study))
-            (staging / DOCUMENT).write_text(document(certificate, laws), encoding="utf-8")
-            (staging / REPORT).write_text(report(certificate, laws, staging), encoding="utf-8")
+            _draw(staging, certificate, has_pdf)
+            write_store(staging / DATA, variables(certificate), run_attributes(study))
+            (staging / DOCUMENT).write_text(document(certificate), encoding="utf-8")
+            (staging / REPORT).write_text(report(certificate, staging), encoding="utf-8")
     for note in certificate.notes:
         console.print(note, soft_wrap=True)
     announce(console, out / REPORT, ", data and figures in the same folder")
@@ -119,25 +117,35 @@ def _check_owner(out: Path, study: Study) -> None:
         )
 
 
-def _draw(folder: Path, certificate: Certificate, laws: Comparison | None, has_pdf: bool) -> None:
-    drawn: list[tuple[str, Callable[..., Any], Any]] = [
-        ("margins", plots.margins, certificate),
-        ("damping", plots.mode_damping, certificate),
-    ]
-    if laws is not None:
-        drawn.append(("laws", plots.law_bars, laws))
+def _statements(certificate: Certificate) -> list[str]:
+    """Lines to print: the verdict, what becomes of modes, what is proven."""
+    texts = verdict(certificate), damping_text(certificate), spillover_text(certificate)
+    proven = () if certificate.proofs is None else proof_texts(certificate.proofs)
+    return [text for text in (*texts, *proven) if text]
+
+
+def _with_fast_move(certificate: Certificate) -> Certificate:
+    """The same with its fast move, or with a note why it cannot run."""
+    try:
+        return certificate._replace(fast_move=run_fast_move(certificate.study))
+    except StudyError as error:
+        return certificate._replace(notes=(*certificate.notes, f"no fast move: {error}"))
+
+
+def _draw(folder: Path, certificate: Certificate, has_pdf: bool) -> None:
+    drawn = [("margins", plots.margins, 3.6), ("damping", plots.mode_damping, 2.65)]
     with figures.styled():
-        for name, plot, data in drawn:
-            figure, axes = figures.new_figure(1, 1, 3.6 if plot is plots.margins else 2.65)
-            plot(data, axes[0, 0])
+        for name, plot, height in drawn:
+            figure, axes = figures.new_figure(1, 1, height)
+            plot(certificate, axes[0, 0])
             figures.save(figure, folder, name, has_pdf)
         if LAWS[certificate.study.control.law].channel == "mode":
             figures.save(plots.leakage(certificate), folder, "leakage", has_pdf)
         figures.write_figure(sketch(certificate.study), folder / "machine.png")
 
 
-def variables(certificate: Certificate, laws: Comparison | None) -> dict[str, Variable]:
-    """Labelled numbers of a certificate and of the comparison of laws."""
+def variables(certificate: Certificate) -> dict[str, Variable]:
+    """Labelled numbers of a certificate."""
     plants = ("basis", "mismatch", "plant_modes")
     modes = (*plants, "link_mode", "pole")
     place, axes = plants[:2], certificate.plants
@@ -202,22 +210,16 @@ def variables(certificate: Certificate, laws: Comparison | None) -> dict[str, Va
             np.array(certificate.required), (), "1", "gain margin required"
         ),
     }
-    if laws is None:
+    move = certificate.fast_move
+    if move is None:
         return part
-    law = ("law",)
+    control = ("control",)
     return part | {
-        "law": Variable(np.array(laws.names), law, "1", "control law"),
-        "law_factor": Variable(laws.factor, law, "1", "factor on its gains"),
-        "law_damping_ratio": Variable(
-            laws.damping_ratio, ("law", "lowest_mode"), "1", "smallest of the links that control it"
+        "control": Variable(
+            np.array(["on", "off"]), control, "1", "of the links, in the fast move"
         ),
-        "law_margin": Variable(laws.margin, law, "1", "smallest over the numbers of plant modes"),
-        "law_residual_rms": Variable(
-            laws.residual_rms, ("law", "link"), "m", "worst station after the fast move"
+        "residual_rms": Variable(
+            move.residual_rms, ("control", "link"), "m", "worst station after the fast move"
         ),
-        "law_peak_voltage": Variable(laws.peak_voltage, law, "V", "peak actuator voltage"),
-        "law_control_energy": Variable(
-            laws.control_energy, law, "V2 s", "integral of the summed squared actuator voltages"
-        ),
-        "law_status": Variable(laws.status, law, *STATUS_LABEL),
+        "status": Variable(move.status, control, *STATUS_LABEL),
     }
