@@ -23,6 +23,8 @@ STRONG = 0.9
 #: Delays within a sample, and the change that half a sample makes beside its phase for which they
 #: are needed [1].
 LEVELS, MATTERS = 8, 0.03
+#: Peaks of the largest eigenvalue just below 1 per loop, near which one more frequency is taken.
+PEAKS = 4
 #: Step of a delay for its derivative [samples].
 SLIGHT = 0.01
 #: Points between neighbouring frequencies where a crossing is looked at again, and how much later
@@ -55,10 +57,8 @@ def _joined(parts: list[_Places]) -> _Places:
 
 def phase_margins(loops: LoopGains, grid: GridGain) -> MarginPlace:
     """Smallest common phase of all commands that makes stable loops unstable [deg], (n,) each."""
-    columns = _columns(grid.radius >= STRONG)
-    gain = np.take_along_axis(grid.gain, columns[..., None, None], axis=1)
-    omega = np.take_along_axis(grid.omega, columns, axis=1)
-    places = _crossings(omega, np.linalg.eigvals(gain), np.arange(len(omega)))
+    omega, _, eigenvalue = _searched(loops, grid)
+    places = _crossings(omega, eigenvalue, np.arange(len(omega)))
     first = _early(places, np.abs(places.log.imag), len(omega))
     places = _looked_again(loops, places.chosen(first))
     sign = np.where(places.log.imag < 0, -1.0, 1.0)
@@ -74,10 +74,8 @@ def phase_margins(loops: LoopGains, grid: GridGain) -> MarginPlace:
 
 def delay_margins(loops: LoopGains, grid: GridGain) -> MarginPlace:
     """Smallest common further delay that makes stable loops unstable [samples], (n,) each."""
-    columns = _columns(grid.radius >= STRONG)
-    omega = np.take_along_axis(grid.omega, columns, axis=1)
-    gain = np.take_along_axis(grid.gain, columns[..., None, None], axis=1)
-    at_once, n = np.linalg.eigvals(gain), len(omega)
+    omega, gain, at_once = _searched(loops, grid)
+    n = len(omega)
     angle = omega * loops.plant.period[:, None]
     half = loops.at_delay(omega, np.full(omega.shape, 0.5))
     change = np.linalg.norm(half * np.exp(0.5j * angle)[..., None, None] - gain, axis=(2, 3))
@@ -98,6 +96,49 @@ def delay_margins(loops: LoopGains, grid: GridGain) -> MarginPlace:
 
     late = _smallest(places, delay, np.ones(len(delay)), rate, eigenvalues, n)
     return late._replace(value=np.minimum(late.value, MOST_DELAY))
+
+
+def _searched(loops: LoopGains, grid: GridGain) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Frequencies that matter [rad/s], rising, (n, Q), L there, and its eigenvalues.
+
+    Where the largest modulus peaks just below 1 at a frequency of the grid, it may exceed 1 beside
+    it: so also where a parabola through three moduli has its top.
+    """
+    columns = _columns(grid.radius >= STRONG)
+    omega = np.take_along_axis(grid.omega, columns, axis=1)
+    gain = np.take_along_axis(grid.gain, columns[..., None, None], axis=1)
+    eigenvalue = np.linalg.eigvals(gain)
+    size = np.abs(eigenvalue).max(axis=2)
+    before, middle, after = size[:, :-2], size[:, 1:-1], size[:, 2:]
+    is_peak = (middle >= before) & (middle >= after) & (middle >= STRONG) & (middle < 1)
+    if not is_peak.any():
+        return omega, gain, eigenvalue
+    highest = np.argsort(-np.where(is_peak, middle, 0.0), axis=1)[:, :PEAKS]
+    tops = _tops(omega, size)
+    top = np.take_along_axis(np.where(is_peak, tops, omega[:, 1:-1]), highest, axis=1)
+    there = loops.searched(top)
+    order = np.argsort(np.concatenate([omega, top], axis=1), axis=1)
+
+    def ordered(*parts: np.ndarray) -> np.ndarray:
+        whole = np.concatenate(parts, axis=1)
+        return np.take_along_axis(whole, order.reshape(*order.shape, *[1] * (whole.ndim - 2)), 1)
+
+    return (
+        ordered(omega, top),
+        ordered(gain, there),
+        ordered(eigenvalue, np.linalg.eigvals(there)),
+    )
+
+
+def _tops(omega: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Tops of parabolas through every three neighbours, between the outer two, (n, Q - 2)."""
+    step, rise = np.diff(omega, axis=1), np.diff(size, axis=1)
+    left, right = step[:, :-1], step[:, 1:]
+    with np.errstate(all="ignore"):  # frequencies that fill up are equal
+        into, out = rise[:, :-1] / left, rise[:, 1:] / right
+        move = (into * right + out * left) / (2 * (into - out))
+    move = np.nan_to_num(move, nan=0.0, posinf=0.0, neginf=0.0)
+    return omega[:, 1:-1] + np.clip(move, -left, right)
 
 
 def _delays(loops: LoopGains, places: _Places) -> tuple[np.ndarray, np.ndarray]:
