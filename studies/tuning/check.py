@@ -44,6 +44,7 @@ from studies.tuning.objective import (
     objectives,
 )
 from studies.tuning.optimise import KEPT, excess
+from studies.tuning.plain_runs import PlainRuns
 from studies.tuning.scenarios import (
     LoopMachines,
     lane_columns,
@@ -143,30 +144,6 @@ def fresh_columns(spec: TuneSpec) -> dict[str, np.ndarray]:
     """Scenarios not used in the tuning."""
     scenarios = spec.tune.scenarios
     return scenario_columns(spec, scenarios.check, scenarios.seed + 1, is_fresh=True)
-
-
-class PlainRuns:
-    """Runs with the real converters, many at a time through one program."""
-
-    def __init__(self, structure: Structure, count: int) -> None:
-        """
-        Args:
-            structure: of all runs.
-            count: of a batch, about.
-        """
-        self.structure = structure
-        self._layout = even_layout(count)
-        self._executor = Executor(structure, self._layout)
-
-    def run(self, cases: Case, count: int) -> Result:
-        """Run cases, leaves (count or 1, ...)."""
-        cases = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape[1:])), cases)
-        parts = []
-        for first in range(0, count, self._layout.size):
-            rows = np.minimum(first + np.arange(self._layout.size), count - 1)
-            part = in_working_precision(jax.tree.map(lambda x, rows=rows: x[rows], cases))
-            parts.append(self._executor.start(part).wait())
-        return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
 
 
 class PartRuns:

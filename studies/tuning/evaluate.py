@@ -20,7 +20,7 @@ from studies.engine.executor import Differentiated, Executor
 from studies.engine.plan import Layout, even_layout, lane_unit
 from studies.engine.preflight import check_run
 from studies.errors import StudyError
-from studies.study.cases import build_structure, in_working_precision
+from studies.study.cases import build_cases, build_structure, in_working_precision
 from studies.study.numbers import study_numbers
 from studies.study.paths import Parts
 from studies.tuning.linear_fidelity import LinearFidelity, LoopEvaluation
@@ -34,6 +34,7 @@ from studies.tuning.objective import (
     objective_of,
     size,
 )
+from studies.tuning.plain_runs import PlainRuns
 from studies.tuning.scenarios import lane_columns, nominal, scenario_columns
 from studies.tuning.spec import BASELINE, Family, TuneSpec
 
@@ -67,11 +68,12 @@ class Evaluator:
         self.goal, self.linear = objective_of(spec), LinearFidelity(spec, families)
         self.is_free = np.stack([family.is_free for family in families])
         every = [spec.parts(family) for family in families]
-        # the baseline's parts first: all designs are measured against it
+        # all designs are measured against the baseline: its program first, if designs have it too
         self._programs = [
             _PartRuns(spec, parts, families, np.flatnonzero([x == parts for x in every]))
-            for parts in dict.fromkeys([spec.parts(), *every])
+            for parts in sorted(dict.fromkeys(every), key=lambda x: x != spec.parts())
         ]
+        self._apart: ScenarioFigures | None = None  # the baseline, if no design has its program
         self.lanes = sum(program.lanes for program in self._programs)  # runs of a batch
         self.run_time = float("nan")  # time per run of the last batch [s]
 
@@ -88,19 +90,16 @@ class Evaluator:
         started = time.perf_counter()
         is_differentiated = (np.isfinite(values) & np.reshape(needs_gradient, (-1, 1))).any(axis=1)
         loop = self.linear.evaluate(values)
-        baseline, parts, order = None, [], []
+        baseline, parts = self._baseline_apart(), []
         for program in self._programs:
             rows = program.rows
             runs = program.run(values[rows])
             if baseline is None:
                 metrics = jax.tree.map(lambda x: x[0], runs.metrics)
-                self._check_baseline(runs.status[0], metrics)
-                baseline = ScenarioFigures(metrics, self.linear.baseline_terms)
-            if rows.size:
-                own = jax.tree.map(lambda x, rows=rows: x[rows], loop)
-                parts.append(program.judge(self.goal, runs, own, baseline, is_differentiated[rows]))
-                order.append(rows)
-        back = np.argsort(np.concatenate(order))
+                baseline = self._measured(runs.status[0], metrics)
+            own = jax.tree.map(lambda x, rows=rows: x[rows], loop)
+            parts.append(program.judge(self.goal, runs, own, baseline, is_differentiated[rows]))
+        back = np.argsort(np.concatenate([program.rows for program in self._programs]))
         whole = _Judged(*(np.concatenate(x)[back] for x in zip(*parts, strict=True)))
         if is_compiled:
             self.run_time = (time.perf_counter() - started) / self.lanes
@@ -114,6 +113,26 @@ class Evaluator:
             status=whole.status,
             residual=whole.residual,
         )
+
+    def _baseline_apart(self) -> ScenarioFigures | None:
+        """The baseline, run once without derivatives, if no design has its law and drive."""
+        spec = self.spec
+        if self._apart is None and spec.parts() not in map(spec.parts, self.families):
+            columns = scenario_columns(spec, spec.tune.scenarios.count, spec.tune.scenarios.seed)
+            count, structure = (
+                len(columns["run.seed"]),
+                _smooth(tuned_structure(spec, spec.parts())),
+            )
+            study = spec.study.change(run__smooth=True)
+            cases = build_cases(study, lane_columns(spec, columns, [None]), structure)
+            result = PlainRuns(structure, count).run(cases, count)
+            self._apart = self._measured(result.status, result.metrics)
+        return self._apart
+
+    def _measured(self, codes: np.ndarray, metrics: Any) -> ScenarioFigures:
+        """What designs are measured against, from the baseline's runs."""
+        self._check_baseline(codes, metrics)
+        return ScenarioFigures(metrics, self.linear.baseline_terms)
 
     def _check_baseline(self, codes: np.ndarray, metrics: Any) -> None:
         is_bad = ~np.isin(codes, status.FINISHED)
@@ -173,7 +192,7 @@ class _PartRuns:
             rows: places of those designs among them.
         """
         self.rows, self._families = rows, [families[k] for k in rows]
-        structure = tuned_structure(spec, parts)._replace(is_smooth=True, has_noise=True)
+        structure = _smooth(tuned_structure(spec, parts))
         columns = scenario_columns(spec, spec.tune.scenarios.count, spec.tune.scenarios.seed)
         self.scenarios = len(columns["run.seed"])
         self.lanes = self.scenarios * (1 + len(rows))
@@ -283,6 +302,11 @@ def first_residual(goal: Objective, metrics: Any) -> np.ndarray:
     if metrics.residual_rms is None:
         return np.full(len(metrics.saturated_fraction), np.nan)
     return np.sqrt(np.mean(metrics.residual_rms[:, 0, list(goal.links)] ** 2, axis=(1, 2)))
+
+
+def _smooth(structure: Structure) -> Structure:
+    """With limits and rounding made smooth, noise in place of rounding."""
+    return structure._replace(is_smooth=True, has_noise=True)
 
 
 def tuned_structure(spec: TuneSpec, parts: Parts) -> Structure:

@@ -20,7 +20,7 @@ from studies.study.cases import build_cases
 from studies.study.entries import parse_entries
 from studies.study.resolution import is_deflection, least_step, resolution_text
 from studies.study.spec import Study
-from studies.tuning.check import JudgedDesign, PartRuns, PlainRuns, judge
+from studies.tuning.check import JudgedDesign, PartRuns, judge
 from studies.tuning.loop_figures import (
     DesignFigures,
     allowed_on,
@@ -38,6 +38,7 @@ from studies.tuning.objective import (
     objective_of,
 )
 from studies.tuning.optimise import KEPT, excess
+from studies.tuning.plain_runs import PlainRuns
 from studies.tuning.scenarios import fresh_machines, lane_columns, scenario_columns, tuned_machines
 from studies.tuning.spec import BASELINE, Family, TuneSpec
 
