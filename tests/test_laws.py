@@ -15,14 +15,14 @@ from studies.engine.runs import run_study
 from studies.errors import StudyError
 from studies.laws import run as laws
 from studies.laws.candidates import AS_GIVEN, Contender, drive_candidates, law_candidates
-from studies.laws.judging import MOVES, breaking_text, changes, judging_sweep
+from studies.laws.judging import MOVES, breaking_text, changes, judging_sweep, longer
 from studies.laws.machines import machines_of, spread_of, with_noise
 from studies.laws.ranking import rank
-from studies.laws.tuning import Budget, Tuned, make_budget, tuning_of
+from studies.laws.tuning import Budget, Tuned, make_budget, tune_candidate, tuning_of
 from studies.show.document import schema
 from studies.space.table import build_table
 from studies.study.cases import build_cases, build_structure
-from studies.study.spec import paper_study
+from studies.study.spec import paper_study, parse_study
 from studies.study.window import with_window
 
 STUDY = with_window(paper_study().change(link__modes=4, run__duration=0.12, motion__move_time=0.05))
@@ -118,6 +118,42 @@ def test_noise_is_that_of_the_design_or_one_step_of_its_converter():
     assert with_noise(STUDY).electronics.adc_noise == step
     noisy = STUDY.change(electronics__adc_noise=1e-3)
     assert with_noise(noisy) == noisy
+
+
+def test_specified_poles_leave_out_no_law():
+    placed = STUDY.change(control__damping=0.1)
+    for candidate in law_candidates(placed):
+        assert candidate.study(placed).control.law == candidate.settings["control.law"]
+        tuning_of(placed, candidate, Budget(50.0, 0.4))
+
+
+def test_the_slowest_move_fits_into_the_run():
+    study = STUDY.change(run__duration=0.095)
+    assert longer(study).run.duration == pytest.approx(0.095 + 0.25 * 0.05)
+    parse_study(
+        longer(study).model_dump() | {"motion": study.motion.model_dump() | {"move_time": 0.0625}}
+    )
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"control__feedback": "ideal"}, "control.feedback"),
+        ({"control__links": (False, False, False)}, "control.links"),
+        ({"control__gain_factor": 0.0}, "control.gain_factor"),
+    ],
+)
+def test_a_design_without_controller_is_refused(fields, message, tmp_path):
+    with pytest.raises(StudyError, match=message):
+        laws.run_laws(STUDY.change(**fields), tmp_path / "out", is_quiet=True)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_damaged_tuning_is_not_a_law_that_fails(tmp_path):
+    file = tmp_path / "imsc.npz"
+    file.write_bytes(b"no archive")
+    with pytest.raises(StudyError, match="damaged"):
+        tune_candidate(STUDY, law_candidates(STUDY)[0], Budget(50.0, 0.4), file, print)
 
 
 def test_changes_rebuild_a_design():

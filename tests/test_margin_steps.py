@@ -16,6 +16,7 @@ from studies.engine.margins import (
     _converge,
     _is_confirmed,
     _judged,
+    _JudgedBlock,
     _rightmost,
     judge_loops,
 )
@@ -100,7 +101,7 @@ HERTZ = 2 * np.pi
 def judged(monkeypatch):
     """Figures and doubts from what the steps found, by case: value and frequency [Hz]."""
 
-    def judge(seen, found, met, ends=None, weaker=1.0, again=None, **changes):
+    def judge(seen, found, met, ends=None, weaker=1.0, again=None, lanes_lost=(), **changes):
         def crossings(rows):
             case, value, hertz = (np.array(x) for x in zip(*rows, strict=True))
             return Crossings(case, value.astype(float), HERTZ * hertz)
@@ -120,9 +121,9 @@ def judged(monkeypatch):
         at_end = np.zeros(N), np.full(N, np.nan)
         for case, value in (ends or {}).items():
             at_end[0][case], at_end[1][case] = value, 0.0
-        nothing = np.empty(0)
+        nothing, lost = np.empty(0), np.isin(np.arange(N), lanes_lost)
         patches = {
-            "_sweep_axis": lambda *_: (crossings(seen), nothing, nothing),
+            "_sweep_axis": lambda *_: (crossings(seen), nothing, nothing, lost),
             "_refine": lambda *_: crossings(found),
             "_converge": meets,
             "_end_eigenvalues": lambda *_: at_end,
@@ -149,7 +150,7 @@ def judged(monkeypatch):
 
 def test_margins_are_the_inverse_of_the_rightmost_crossings(judged):
     rows = [(0, 0.5, 450), (0, 0.25, 110), (1, 4.0, 110), (2, 0.1, 990), (3, 0.02, 450)]
-    figures, is_doubtful = judged(rows, rows, [(x, 0.0) for _, x, _ in rows])
+    figures, is_doubtful, _ = judged(rows, rows, [(x, 0.0) for _, x, _ in rows])
     np.testing.assert_allclose(figures.gain_margin[:5], [2, 0.25, 10, 50, HIGHEST])
     np.testing.assert_allclose(figures.breaking_frequency[:4], [450, 110, 990, 450])
     assert figures.breaking_mode[:4].tolist() == [2, 1, 3, 2]
@@ -161,7 +162,7 @@ def test_margins_are_the_inverse_of_the_rightmost_crossings(judged):
 def test_what_did_not_converge_leaves_the_margin_to_another_crossing(judged):
     """Far starts: their last step was not small, however large the value where they ended."""
     rows = [(0, 0.9, 450), (0, 0.25, 110), (1, 0.8, 450)]
-    figures, _ = judged(rows, rows, [(5.0, 2.0), (0.25, 1e-4), (0.8, 0.01)])
+    figures, *_ = judged(rows, rows, [(5.0, 2.0), (0.25, 1e-4), (0.8, 0.01)])
     np.testing.assert_allclose(figures.gain_margin[:2], [4, HIGHEST])
     assert figures.breaking_mode[0] == 1
 
@@ -170,26 +171,26 @@ def test_strange_crossings_are_doubtful(judged):
     """Seen on the sweep, not found again, and to the right of what was found."""
     seen = [(0, 0.5, 450), (1, 3.0, 450), (1, 0.4, 110), (2, 0.3, 110), (2, 0.9, 450), (3, 0.5, 9)]
     found = [(0, 0.5, 450), (1, 0.4, 110), (2, 0.9, 450)]
-    figures, is_doubtful = judged(seen, found, [(0.5, 0.0), (0.4, 0.0), (0.9, 0.0)])
+    figures, is_doubtful, _ = judged(seen, found, [(0.5, 0.0), (0.4, 0.0), (0.9, 0.0)])
     assert is_doubtful.tolist() == [False, True, False, True, *[False] * 4]
     np.testing.assert_allclose(figures.gain_margin[:4], [2, 2.5, 1 / 0.9, HIGHEST])
 
 
 def test_weakened_loops_get_their_own_margin(judged):
     rows = [(0, 0.5, 450), (1, 0.002, 110)]
-    figures, _ = judged(rows, rows, [(0.5, 0.0), (0.002, 0.0)], weaker=10.0)
+    figures, *_ = judged(rows, rows, [(0.5, 0.0), (0.002, 0.0)], weaker=10.0)
     np.testing.assert_allclose(figures.gain_margin[:2], [0.2, 50])
 
 
 def test_a_crossing_beside_the_one_found_counts_if_it_is_larger(judged):
     rows = [(0, 0.5, 450), (1, 0.25, 110)]
-    figures, _ = judged(rows, rows, [(0.5, 0.0), (0.25, 0.0)], again={0: 0.625, 1: 0.125})
+    figures, *_ = judged(rows, rows, [(0.5, 0.0), (0.25, 0.0)], again={0: 0.625, 1: 0.125})
     np.testing.assert_allclose(figures.gain_margin[:2], [1.6, 4])
 
 
 def test_ends_of_the_axis_count_too(judged):
     rows = [(0, 0.5, 450), (1, 0.25, 110)]
-    figures, _ = judged(rows, rows, [(0.5, 0.0), (0.25, 0.0)], ends={0: 0.4, 1: 0.8, 2: 0.1})
+    figures, *_ = judged(rows, rows, [(0.5, 0.0), (0.25, 0.0)], ends={0: 0.4, 1: 0.8, 2: 0.1})
     np.testing.assert_allclose(figures.gain_margin[:3], [2, 1.25, 10])
     assert figures.breaking_frequency[:3].tolist() == [450, 0, 0]
     assert figures.breaking_mode[0] == 2 and np.all(np.isnan(figures.breaking_mode[1:3]))
@@ -198,8 +199,17 @@ def test_ends_of_the_axis_count_too(judged):
 def test_machines_that_fall_by_themselves_have_no_margin(judged):
     growth = np.where(np.arange(N) == 1, 1.0, -1.0)
     rows = [(0, 0.5, 450), (1, 0.25, 110)]
-    figures, _ = judged(rows, rows, [(0.5, 0.0), (0.25, 0.0)], growth=growth)
+    figures, *_ = judged(rows, rows, [(0.5, 0.0), (0.25, 0.0)], growth=growth)
     np.testing.assert_allclose(figures.gain_margin[:2], [2, 0])
+
+
+def test_what_the_sweep_cannot_tell_is_left_to_eigenvalues(judged):
+    """Where it was thrown away, and where nothing was found of gains examined much weaker."""
+    rows = [(0, 0.5, 450), (1, 0.25, 110)]
+    *_, is_beyond = judged(rows, rows, [(0.5, 0.0), (0.25, 0.0)], lanes_lost=[1])
+    assert np.flatnonzero(is_beyond).tolist() == [1]
+    *_, is_beyond = judged(rows, rows, [(0.5, 0.0), (0.25, 0.0)], weaker=20.0)
+    assert not is_beyond[:2].any() and is_beyond[2:].all()
 
 
 # --- two sweeps ----------------------------------------------------------------------------------
@@ -218,7 +228,7 @@ def test_doubtful_loops_are_walked_again_more_finely(monkeypatch):
             breaking_mode=value + 200,
             least_damping=np.stack([value] * 3, axis=1),
         )
-        return figures, np.isin(rows, [1, 4])
+        return _JudgedBlock(figures, np.isin(rows, [1, 4]), np.zeros(len(rows), bool))
 
     monkeypatch.setattr(margins, "_judge_block", block)
     study = paper_study()

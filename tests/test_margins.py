@@ -29,7 +29,7 @@ from studies.engine.stability import loop_report, with_margin_modes
 from studies.engine.sweep import run_sweep
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table
-from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.cases import as_arrays, build_case, build_cases, build_structure
 from studies.study.margin import HIGHEST, LOWEST
 from studies.study.spec import paper_study
 from studies.sweeps.show import ranked_cases
@@ -142,6 +142,27 @@ def too_strong(loops, seed, decades):
     factor = 10 ** rng.uniform(0, decades, len(control.gain_factor))
     control = control._replace(gain_factor=control.gain_factor * factor)
     return loops._replace(cases=loops.cases._replace(control=control))
+
+
+def test_margins_of_strain_rate_feedback_do_not_depend_on_the_gain_factor():
+    """A margin times the factor is the largest factor; at 5 Hz such a loop is not weak any more."""
+    study = STUDY.change(
+        link__modes=3,
+        control__law="srf",
+        control__velocity_gain=(0.0183, 0.0207, 0.0201),
+        electronics__highpass_hz=7.25,
+        electronics__lowpass_ratio=(0.874, 2.0, 2.0),
+        drive__kp=4000.0,
+        drive__kd=300.0,
+    )
+    factors = np.array([0.1, 0.3, 0.559, 1.3, 3.0])
+    structure = build_structure(study)
+    cases = build_cases(study, {"control.gain_factor": factors}, structure)
+    found = judge_loops(structure, cases)
+    largest = found.gain_margin * factors
+    np.testing.assert_allclose(largest, largest[0], rtol=0.02)
+    assert largest[0] < HIGHEST * factors[0]
+    np.testing.assert_allclose(found.breaking_frequency, found.breaking_frequency[0], rtol=0.02)
 
 
 def test_margins_of_loops_much_too_strong():

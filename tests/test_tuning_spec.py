@@ -209,6 +209,15 @@ def deep(n):
         ),
         ({"free": GAIN, "objective": {"disk_margin[1]": 1.0}}, "no such entry; allowed: disk_marg"),
         ({"free": GAIN, "objective": {"disk_margin": 0.0}}, "disk_margin = 0.0; allowed: a number"),
+        ({"free": GAIN, "limits": {"disk_margin": 2.5}}, "disk_margin = 2.5; allowed: .* <= 2"),
+        (
+            {"free": GAIN, "limits": {"delay_margin": 17.0}},
+            "delay_margin = 17.0; allowed: .* <= 16",
+        ),
+        (
+            {"free": GAIN, "scenarios": {"each": {"drive.kind": ["pd", "computed_torque"]}}},
+            "each.drive.kind: is the same in all scenarios; take tune.families",
+        ),
         ({"free": GAIN, "limits": {"peak_volt": 1.0}}, "did you mean 'peak_voltage'"),
         (
             {"free": GAIN, "objective": {"residual_rms[3]": 1.0}},

@@ -70,6 +70,8 @@ STILL = 0.01
 LEAST_DAMPED, UNEVEN = 5e-4, 20.0
 #: Separates the eigenvalues of idle channels, on the sweep and in the refinement.
 SPREAD, FINE_SPREAD = 1e-3, 1e-6
+#: Beyond this an eigenvalue on the sweep was thrown away by another one and does not return [1].
+FARTHEST = 1e6
 #: Crossings examined again per case, and kept per examined place.
 CHOSEN, KEPT = 4, 2
 #: The sweep starts from small numbers, so stronger loops are examined with weaker gains [1].
@@ -123,21 +125,22 @@ def judge_loops(structure: Structure, cases: Case) -> LoopFigures:
             parts = [rows[k : k + share] for k in range(0, len(rows), share)]
             judge_part = partial(_judge_block, structure, sweep, most, whole)
             doubtful = []
-            for part, (those, is_doubtful) in zip(parts, pool.map(judge_part, parts), strict=True):
+            for part, those in zip(parts, pool.map(judge_part, parts), strict=True):
                 for name in BATCHED:
-                    getattr(figures, name)[part] = getattr(those, name)
-                doubtful.append(part[is_doubtful])
+                    getattr(figures, name)[part] = getattr(those.figures, name)
+                doubtful.append(part[those.is_doubtful])
+                is_beyond[part] = those.is_beyond
             return np.concatenate(doubtful)
 
         is_sharp = _least_damping(structure, whole) < LEAST_DAMPED
         is_sharp |= _unevenness(whole) > UNEVEN
         # no return difference link by link
         is_sharp |= LAWS[structure.law].channel == "none" or DRIVES[structure.drive].is_sampled
-        rows = np.flatnonzero(~is_sharp)
+        rows, is_beyond = np.flatnonzero(~is_sharp), np.zeros(count, bool)
         for sweep in SWEEPS:
             if len(rows):
                 rows = judge(rows, sweep)
-    for k in map(int, np.flatnonzero(is_sharp)):
+    for k in map(int, np.flatnonzero(is_sharp | is_beyond)):
         _judge_by_eigenvalues(structure, jax.tree.map(lambda x, k=k: x[k], whole), figures, k)
     return figures
 
@@ -204,6 +207,14 @@ def no_margins(structure: Structure, cases: Case) -> LoopFigures:
     )
 
 
+class _JudgedBlock(NamedTuple):
+    """Figures of a block's cases."""
+
+    figures: LoopFigures
+    is_doubtful: np.ndarray  # spurious crossings were seen
+    is_beyond: np.ndarray  # the sweep was lost, or saw nothing and could not see up to `HIGHEST`
+
+
 class Crossings(NamedTuple):
     """Where eigenvalues can be real and positive, (k,) each."""
 
@@ -214,8 +225,8 @@ class Crossings(NamedTuple):
 
 def _judge_block(
     structure: Structure, sweep: FrequencySweep, most: int, cases: Case, rows: np.ndarray
-) -> tuple[LoopFigures, np.ndarray]:
-    """Figures of some cases, at most a block, and which of them had spurious crossings."""
+) -> _JudgedBlock:
+    """Figures of some cases, at most a block."""
     mask = cases.control.link_mask[rows].T
     n_links = np.sum(mask > 0, axis=0)
     filled = rows[np.minimum(np.arange(BLOCK), len(rows) - 1)]  # one size, one compilation
@@ -247,12 +258,12 @@ def _judged(
     weaker: np.ndarray,
     sweep: FrequencySweep,
     ratio: np.ndarray,
-) -> tuple[LoopFigures, np.ndarray]:
+) -> _JudgedBlock:
     """Figures of loops, examined with gains `weaker` by these factors, (lanes,)."""
     count, top = len(response.period), np.pi / response.period
     response = _with_gains(response, 1 / weaker)
     least = np.maximum(1 / (HIGHEST * weaker), SPREAD)
-    seen, left, right = _sweep_axis(response, modes, sweep, 0.8 * least)
+    seen, left, right, is_lost = _sweep_axis(response, modes, sweep, 0.8 * least)
     start = _refine(response, seen, left, right, 0.8 * least)
     refined = np.zeros(count)
     np.maximum.at(refined, start.case, start.value)
@@ -294,7 +305,8 @@ def _judged(
         breaking_mode=np.where(is_finite & breaks, order, np.nan),
         least_damping=ratio,
     )
-    return figures, is_doubtful & is_finite
+    is_beyond = is_lost | (~breaks & (HIGHEST * weaker * SPREAD > 1))
+    return _JudgedBlock(figures, is_doubtful & is_finite, is_beyond & is_finite)
 
 
 def _filters_grow(response: LoopResponse) -> np.ndarray:
@@ -338,15 +350,17 @@ def sweep_frequencies(
 
 def _sweep_axis(
     response: LoopResponse, modes: AssembledModes, sweep: FrequencySweep, least: np.ndarray
-) -> tuple[Crossings, np.ndarray, np.ndarray]:
-    """The rightmost crossings of each case and the frequencies [rad/s] on either side."""
+) -> tuple[Crossings, np.ndarray, np.ndarray, np.ndarray]:
+    """The rightmost crossings of each case, the frequencies [rad/s] on either side, lost cases."""
     omega = np.repeat(sweep_frequencies(modes, response.period, sweep), sweep.repeats, axis=0)
     visit = np.arange(len(omega)) + 1
     kind = np.where(visit % sweep.repeats > 0, 0.0, np.where(visit == sweep.repeats, 1.0, 2.0))
     spread = _spread(response, SPREAD)
     first = -spread.reshape(-1, spread.shape[2])
     loci = _follow_axis(response, spread, Pair(first, 0 * first), omega, kind)
-    return _crossings(loci, np.arange(spread.shape[2]), CHOSEN, least)
+    size = np.hypot(np.asarray(loci.value.re), np.asarray(loci.value.im))
+    is_lost = ~np.all(size < FARTHEST, axis=0)
+    return (*_crossings(loci, np.arange(spread.shape[2]), CHOSEN, least), is_lost)
 
 
 def _crossings(

@@ -85,9 +85,10 @@ def law_candidates(study: Study) -> list[Contender]:
 
 
 def _law_candidate(study: Study, law: Law) -> Contender:
-    settings: dict[str, Any] = {"control.law": law.name}
-    if study.control.has_poles and not law.places_poles:
-        settings |= {"control.damping": (), "control.pole_decay": ()}
+    settings: dict[str, Any] = {}
+    if study.control.has_poles and not law.places_poles:  # first: without them any law is valid
+        settings = {"control.damping": (), "control.pole_decay": ()}
+    settings["control.law"] = law.name
     plain = Contender(law.text, settings, {}, OF_LAWS)
     own = plain.study(study)
     if law.channel == "patch" and law.name != study.control.law:  # its gains have another unit

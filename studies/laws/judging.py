@@ -73,7 +73,15 @@ def judging_sweep(study: Study, designs: list[Study], machines: list[dict[str, A
         "metrics": [*FIGURES, *SHOWN],
         "robustness": list(MARGINS),
     }
-    return parse_sweep(study.model_dump() | {"sweep": sweep})
+    return parse_sweep(longer(study).model_dump() | {"sweep": sweep})
+
+
+def longer(study: Study) -> Study:
+    """The study with a run as much longer as its slowest move of `MOVES`."""
+    times = study.motion.move_time
+    moves = len(study.motion.waypoints) - 1
+    whole = moves * times if isinstance(times, float) else sum(times)
+    return study.change(run__duration=study.run.duration + (max(MOVES) - 1) * whole)
 
 
 def changes(study: Study, design: Study) -> dict[str, Any]:

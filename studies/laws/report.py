@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from studies.laws.findings import LawFindings, verdict
-from studies.laws.judging import FIGURES, MOVES
+from studies.laws.judging import FIGURES, MOVES, longer
 from studies.laws.machines import spread_of
 from studies.laws.ranking import CONFIDENCE
 from studies.show.document import json_text
@@ -137,7 +137,7 @@ def _rms_voltage(findings: LawFindings, k: int) -> float:
     study = findings.controllers[k].study
     count = sum(findings.study.control.links) * patch_centers(study).shape[1]
     energy = _over(findings.judged.metrics["control_energy"][k], np.mean)
-    return float(np.sqrt(energy / (count * study.run.duration)))
+    return float(np.sqrt(energy / (count * longer(study).run.duration)))
 
 
 def _over(values: np.ndarray, over: Any) -> float:

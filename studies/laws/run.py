@@ -73,12 +73,7 @@ def run_laws(
     """
     config.require_configured()
     out, console = Path(out), console or Console(highlight=False, markup=False)
-    if study.control.feedback != "sampled" or not study.is_controlled:
-        raise field_error(
-            "control.feedback",
-            study.control.feedback,
-            "'sampled', with a controlled link: what is compared is a sampled controller",
-        )
+    _check_design(study)
     study = with_noise(with_window(resolved_study(study)))
     budget = make_budget(study, voltage, margin)
     with locked_folder(out, "comparison"):
@@ -87,6 +82,21 @@ def run_laws(
         names = ("tune", *sweep_phases(_empty_sweep(study)), "rank", "draw")
         with Phases(console, names, is_quiet) as phases:
             return _compare(study, out, budget, phases)
+
+
+def _check_design(study: Study) -> None:
+    """Check that there is a sampled controller to compare.
+
+    Raises:
+        StudyError: there is none.
+    """
+    control = study.control
+    if control.feedback != "sampled":
+        raise field_error("control.feedback", control.feedback, "'sampled' where laws are compared")
+    if not any(control.links):
+        raise field_error("control.links", control.links, "one or more controlled links")
+    if control.gain_factor == 0:
+        raise field_error("control.gain_factor", 0.0, "more than 0 where laws are compared")
 
 
 def _keep_request(file: Path, study: Study, budget: Budget) -> None:

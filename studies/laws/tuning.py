@@ -117,10 +117,19 @@ def tune_candidate(
         budget: what it may spend.
         file: of its progress.
         say: called with the progress of each iteration.
+
+    Raises:
+        StudyError: the file is damaged.
     """
+    before = load_progress(file)
     try:
         spec = tuning_of(study, candidate, budget)
-        at = _optimised(spec, file, say)
+    except StudyError as error:
+        return Tuned(candidate, None, str(error), len(candidate.free))
+    if before is not None and not is_compatible(spec, before):
+        raise StudyError(f"{file}: damaged; delete it")
+    try:
+        at = _optimised(spec, before, file, say)
     except StudyError as error:
         return Tuned(candidate, None, str(error), len(candidate.free))
     best, family = at.winner(0), spec.moving[0]
@@ -131,11 +140,10 @@ def tune_candidate(
     return Tuned(candidate, tuned, _violated(spec, at, best), count)
 
 
-def _optimised(spec: TuneSpec, file: Path, say: Callable[[str], None]) -> Progress:
+def _optimised(
+    spec: TuneSpec, before: Progress | None, file: Path, say: Callable[[str], None]
+) -> Progress:
     """Progress at the end of a tuning, which its file keeps."""
-    before = load_progress(file)
-    if before is not None and not is_compatible(spec, before):
-        raise StudyError(f"{file}: damaged; delete it")
 
     def keep(at: Progress) -> None:
         save_progress(file, at)

@@ -25,7 +25,7 @@ from pydantic import ValidationError
 
 from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
-from jaxmodel.loop_figures import MARGINS, PEAKS
+from jaxmodel.loop_figures import MARGINS, MOST_DELAY, MOST_PHASE, PEAKS
 from jaxmodel.metrics import METRICS
 from studies.engine.preflight import check_run
 from studies.errors import StudyError, field_error, nearest, shown, shown_name
@@ -55,6 +55,8 @@ LOOP_LIMITS = (*OF_LOOP, "singularity_distance")
 LOOP_TERMS = ("slowest_decay", "spillover", *MARGINS, *PEAKS)
 #: Lower ones among them; the others are upper ones.
 LOWER = ("gain_margin", "slowest_decay", "singularity_distance", *MARGINS)
+#: Largest values of margins.
+MOST = {"disk_margin": 2.0, "phase_margin": MOST_PHASE, "delay_margin": MOST_DELAY}
 #: Runs in one batch.
 MOST_RUNS = 50_000
 #: Limit that stands for the baseline's value.
@@ -250,7 +252,8 @@ def _check_figures(tune: Tune, study: Study) -> None:
         _check_metric(name, "tune.limits", LOOP_LIMITS, study)
         if limit != BASELINE:
             path, hint = f"tune.limits.{shown_name(name)}", BASELINE * isinstance(limit, str)
-            _check_positive(limit, 1e30, path, more=f" or {BASELINE!r}", hint=hint)
+            most = MOST.get(name, 1e30)
+            _check_positive(limit, most, path, more=f" or {BASELINE!r}", hint=hint)
     for name, part in tune.limits.items():
         metric = _field(name)
         whole = tune.limits.get(metric, BASELINE)
@@ -282,6 +285,7 @@ def _check_machines(scenarios: Scenarios, study: Study) -> None:
     for name, values in scenarios.machines.items():
         path = f"tune.scenarios.machines.{shown_name(name)}"
         known_field(name, study, "tune.scenarios.machines")
+        _check_program(name, path)
         if name.partition(".")[0] in ("run", "metrics", "motion"):
             raise StudyError(f"{path}: allowed: the machine and its control; each takes others")
         if not isinstance(values, list):
@@ -301,6 +305,16 @@ def _check_machines(scenarios: Scenarios, study: Study) -> None:
             f"tune.scenarios.machines: lists of unequal length ({lengths}); allowed: one value for "
             "each machine"
         )
+
+
+def _check_program(name: str, path: str) -> None:
+    """Check that a field of scenarios does not choose the law or drive.
+
+    Raises:
+        StudyError: it does.
+    """
+    if name in ("control.law", "drive.kind"):
+        raise StudyError(f"{path}: is the same in all scenarios; take tune.families for others")
 
 
 def _each_machine(scenarios: Scenarios) -> list[dict[str, Any]]:
@@ -389,6 +403,7 @@ def _moves(tune: Tune, study: Study) -> tuple[dict[str, Any], ...]:
     for name, values in tune.scenarios.each.items():
         path = f"tune.scenarios.each.{shown_name(name)}"
         known_field(name, study, "tune.scenarios.each")
+        _check_program(name, path)
         if not isinstance(values, list) or not values:
             raise field_error(path, values, "a list of values")
         columns[name] = [checked_value(study, name, value, path) for value in values]
@@ -495,10 +510,11 @@ def _family(name: str, written: Any, tune: Tune, study: Study, free: FreeNumbers
     changes = written.get("set", {})
     if not isinstance(changes, dict):
         raise field_error(f"{path}.set", changes, "{field = value}")
-    columns = {}
+    columns, own = {}, study
     for field, value in changes.items():
-        known_field(field, study, f"{path}.set")
-        columns[field] = checked_value(study, field, value, f"{path}.set.{shown_name(field)}")
+        known_field(field, own, f"{path}.set")
+        columns[field] = checked_value(own, field, value, f"{path}.set.{shown_name(field)}")
+        own = parse_study(set_value(own, field, columns[field]))
     is_free = np.array([number.key in names for number in free.numbers])
     parts = parts_of(study, columns)
     is_other = np.array([not parts.owns(number.key) for number in free.numbers])
