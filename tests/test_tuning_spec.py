@@ -212,7 +212,7 @@ def deep(n):
         ({"free": GAIN, "limits": {"disk_margin": 2.5}}, "disk_margin = 2.5; allowed: .* <= 2"),
         (
             {"free": GAIN, "limits": {"delay_margin": 17.0}},
-            "delay_margin = 17.0; allowed: .* <= 16",
+            "= 17.0; allowed: .* <= 16",
         ),
         (
             {"free": GAIN, "scenarios": {"each": {"drive.kind": ["pd", "computed_torque"]}}},
