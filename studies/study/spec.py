@@ -501,10 +501,10 @@ class DriveSection(Section):
     )
     kp: float = described(2e4, "N/m", "position gain Kp", ge=0, le=1e8, free=DESIGN)
     kd: float = described(60.0, "N s/m", "velocity gain Kd", ge=0, le=1e5, free=DESIGN)
+    force_limit: float = described(1e3, "N", "motors, +-", gt=0, le=1e6)
     model_mass: float = described(
         1.0, "1", "platform and payload in the model of computed torque, over the true", ge=0, le=10
     )
-    force_limit: float = described(1e3, "N", "motors, +-", gt=0, le=1e6)
     coulomb_friction: float = described(
         0.0, "N", "F_c of F_c tanh(v/v_0)", ge=0, le=1e3, free=MACHINE
     )
