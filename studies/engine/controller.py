@@ -84,7 +84,7 @@ def check_codable(study: Study) -> None:
 
 def _check_exportable(study: Study) -> None:
     control, electronics = study.control, study.electronics
-    step = electronics.adc_range / 2**electronics.adc_bits
+    step = electronics.adc_step
     if not step < electronics.conditioner_bias < electronics.adc_range - 2 * step:
         raise field_error(
             "electronics.conditioner_bias",

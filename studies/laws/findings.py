@@ -18,6 +18,7 @@ from studies.laws.judging import FIGURES, Judged, changes
 from studies.laws.ranking import RESAMPLES, Ranking, rank
 from studies.laws.tuning import Budget, Tuned
 from studies.publish import shown
+from studies.study.entries import controlled_links
 from studies.study.paths import set_values
 from studies.study.resolution import least_step, resolution_text
 from studies.study.spec import Study, parse_study
@@ -208,8 +209,8 @@ def _equals(findings: LawFindings) -> list[str]:
 def _resolution(findings: LawFindings) -> str:
     """Warning about residual vibration that the controller cannot measure."""
     study, judged = findings.study, findings.judged
-    links = tuple(k for k, is_on in enumerate(study.control.links) if is_on)
-    step = least_step("residual_rms", frame_of(*check_run(study)).adc_step, links)
+    adc_step = frame_of(*check_run(study)).adc_step
+    step = least_step("residual_rms", adc_step, controlled_links([study]))
     medians = np.array(
         [np.nanmedian(judged.metrics["residual_rms"][k]) for k in findings.competing]
     )

@@ -30,8 +30,7 @@ def with_noise(study: Study) -> Study:
     """The design, with noise of one step of the converter [V rms] where it states none."""
     if study.electronics.adc_noise > 0:
         return study
-    electronics = study.electronics
-    return study.change(electronics__adc_noise=electronics.adc_range / 2**electronics.adc_bits)
+    return study.change(electronics__adc_noise=study.electronics.adc_step)
 
 
 def machines_of(study: Study, count: int, seed: int) -> list[dict[str, Any]]:

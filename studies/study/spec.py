@@ -489,6 +489,11 @@ class ElectronicsSection(Section):
     adc_noise: float = described(0.0, "V", "rms at the ADC input", ge=0, le=10)
     voltage_limit: float = described(100.0, "V", "actuators, +-", gt=0, le=1e4)
 
+    @property
+    def adc_step(self) -> float:
+        """One code of the ADC [V]."""
+        return self.adc_range / 2**self.adc_bits
+
 
 class DriveSection(Section):
     """Slider servo and disturbances."""

@@ -44,7 +44,7 @@ from studies.tuning.objective import (
     objectives,
 )
 from studies.tuning.optimise import KEPT, excess
-from studies.tuning.plain_runs import PlainRuns
+from studies.tuning.plain_runs import PlainRuns, baseline_runs
 from studies.tuning.scenarios import (
     LoopMachines,
     lane_columns,
@@ -304,7 +304,9 @@ def search(spec: TuneSpec, linear: LinearFidelity, position: int) -> RandomSearc
     parts = spec.parts(family)
     count, structure = len(columns["run.seed"]), shown_structure(spec, parts)
     is_own = parts == spec.parts()
-    measure = None if is_own else _baseline_metrics(spec, columns)
+    measure = None
+    if not is_own:
+        measure = baseline_runs(spec, shown_structure(spec, spec.parts()), columns).metrics
     lanes = lane_columns(spec, columns, [None if is_own else family, *[family] * CHUNK])
     numbers = study_numbers(spec.study, structure, lanes)
     layout = even_layout(count * (1 + CHUNK))
@@ -352,10 +354,3 @@ def search(spec: TuneSpec, linear: LinearFidelity, position: int) -> RandomSearc
         run_time=run_time,
         runs=n * count,
     )
-
-
-def _baseline_metrics(spec: TuneSpec, columns: dict[str, np.ndarray]) -> Any:
-    """Metrics of the baseline in scenarios, by the program of its own law and drive."""
-    count, structure = len(columns["run.seed"]), shown_structure(spec, spec.parts())
-    cases = build_cases(spec.study, lane_columns(spec, columns, [None]), structure)
-    return PlainRuns(structure, count).run(cases, count).metrics

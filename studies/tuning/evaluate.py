@@ -20,7 +20,7 @@ from studies.engine.executor import Differentiated, Executor
 from studies.engine.plan import Layout, even_layout, lane_unit
 from studies.engine.preflight import check_run
 from studies.errors import StudyError
-from studies.study.cases import build_cases, build_structure, in_working_precision
+from studies.study.cases import build_structure, in_working_precision
 from studies.study.numbers import study_numbers
 from studies.study.paths import Parts
 from studies.tuning.linear_fidelity import LinearFidelity, LoopEvaluation
@@ -34,7 +34,7 @@ from studies.tuning.objective import (
     objective_of,
     size,
 )
-from studies.tuning.plain_runs import PlainRuns
+from studies.tuning.plain_runs import baseline_runs
 from studies.tuning.scenarios import lane_columns, nominal, scenario_columns
 from studies.tuning.spec import BASELINE, Family, TuneSpec
 
@@ -119,13 +119,8 @@ class Evaluator:
         spec = self.spec
         if self._apart is None and spec.parts() not in map(spec.parts, self.families):
             columns = scenario_columns(spec, spec.tune.scenarios.count, spec.tune.scenarios.seed)
-            count, structure = (
-                len(columns["run.seed"]),
-                _smooth(tuned_structure(spec, spec.parts())),
-            )
-            study = spec.study.change(run__smooth=True)
-            cases = build_cases(study, lane_columns(spec, columns, [None]), structure)
-            result = PlainRuns(structure, count).run(cases, count)
+            structure = _smooth(tuned_structure(spec, spec.parts()))
+            result = baseline_runs(spec, structure, columns)
             self._apart = self._measured(result.status, result.metrics)
         return self._apart
 

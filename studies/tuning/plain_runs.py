@@ -9,7 +9,22 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.simulate import Result
 from studies.engine.executor import Executor
 from studies.engine.plan import even_layout
-from studies.study.cases import in_working_precision
+from studies.study.cases import build_cases, in_working_precision
+from studies.tuning.scenarios import lane_columns
+from studies.tuning.spec import TuneSpec
+
+
+def baseline_runs(spec: TuneSpec, structure: Structure, columns: dict[str, np.ndarray]) -> Result:
+    """Runs of a tuning's baseline in scenarios, by a program of its law and drive.
+
+    Args:
+        spec: of the tuning.
+        structure: of the program.
+        columns: from `scenario_columns`.
+    """
+    count, study = len(columns["run.seed"]), spec.study.change(run__smooth=structure.is_smooth)
+    cases = build_cases(study, lane_columns(spec, columns, [None]), structure)
+    return PlainRuns(structure, count).run(cases, count)
 
 
 class PlainRuns:

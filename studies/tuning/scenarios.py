@@ -12,7 +12,7 @@ from studies.show.units import count_text
 from studies.space.axes import column_of
 from studies.study.cases import build_cases, build_structure
 from studies.study.fields import Columns
-from studies.study.paths import LINKS, as_tuples, known_field, set_value
+from studies.study.paths import LINKS, as_tuples, known_field, set_values
 from studies.study.spec import Study, parse_study
 from studies.tuning.spec import Family, TuneSpec, others
 
@@ -143,6 +143,5 @@ def _is_everywhere(column: np.ndarray, value: Any) -> bool:
 def nominal(spec: TuneSpec, family: Family | None) -> Study:
     """The nominal machine on the first move, with a family's settings."""
     study = family.study(spec.study) if family else spec.study
-    for name, value in spec.moves[0].items():
-        study = parse_study(set_value(study, name, value))
-    return study
+    move = spec.moves[0]
+    return parse_study(set_values(study, move)) if move else study

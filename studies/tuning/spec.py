@@ -42,6 +42,7 @@ from studies.study.paths import (
     overlaps,
     parts_of,
     set_value,
+    set_values,
 )
 from studies.study.spec import Section, Study, described, parse_study
 from studies.study.window import check_varied, with_window
@@ -116,9 +117,7 @@ class Family(NamedTuple):
 
     def study(self, study: Study) -> Study:
         """The study with this family's settings."""
-        for name, value in self.columns.items():
-            study = parse_study(set_value(study, name, value))
-        return study
+        return parse_study(set_values(study, self.columns)) if self.columns else study
 
 
 class TuneSpec(NamedTuple):

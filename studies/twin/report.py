@@ -193,7 +193,7 @@ def report(result: TwinResult, images: Path | None = None) -> str:
         images: folder with the figure; None: a page without.
     """
     electronics, period = result.study.electronics, result.plan.electronics.period
-    rounding = electronics.adc_range / 2**electronics.adc_bits / electronics.conditioner_gain
+    rounding = electronics.adc_step / electronics.conditioner_gain
     return page(
         "twin/report.html",
         images,
