@@ -512,3 +512,26 @@ def test_every_command_has_a_call_in_python():
 
 def test_the_version_is_that_of_the_package(capsys):
     assert run(capsys, "--version") == (0, f"flexlink-studies {studies.__version__}\n", "")
+
+
+def test_only_what_runs_on_a_cluster_needs_its_package():
+    """`tune` and the rest work after an install without extras."""
+    text = """
+import importlib, pkgutil, sys
+for name in ("distributed", "dask", "diffrax", "pyuff", "blackjax", "control"):
+    sys.modules[name] = None
+import studies
+lacking = []
+for module in pkgutil.walk_packages(studies.__path__, "studies."):
+    try:
+        importlib.import_module(module.name)
+    except ImportError:
+        lacking.append(module.name)
+print(*sorted(lacking))
+"""
+    run = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=120)
+    assert run.stdout.split() == [
+        "studies.cluster.runner",
+        "studies.cluster.worker",
+        "studies.tuning.workers",
+    ], run.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,11 +16,17 @@ from studies.cluster.connect import (
     Scheduler,
     Workers,
     WorkerTimeout,
+    on_workers,
 )
 from studies.config import start
 from studies.errors import StudyError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from distributed import Client
+
+    from studies.tuning.evaluate import Evaluator
     from studies.tuning.spec import TuneSpec
 
 
@@ -55,11 +62,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         workers = Workers(scheduler, local_workers, worker_timeout)
         if out is not None and not audit:
             refuse_existing(out, TUNINGS, resume)
-        start(cpu_only=workers.are_named)
+        start()
         from studies.publish import REPORT, announce
         from studies.tuning.run import run_tuning
         from studies.tuning.spec import load_tuning
-        from studies.tuning.workers import evaluator_for
 
         tuning = load_tuning(spec)
         if audit and (out or resume or quiet or explore or workers.are_named):
@@ -77,7 +83,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             if not quiet:
                 console.print(text, soft_wrap=True)
 
-        with evaluator_for(tuning, workers, notify) as evaluator:
+        with _evaluator_for(tuning, workers, notify) as evaluator:
             run_tuning(tuning, out, resume, console, quiet, evaluator)
         announce(console, out / REPORT, "; tuned studies in the same folder")
         if explore:
@@ -85,6 +91,19 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             from studies.tuning.explore import explore_tuning
 
             write_explorer(out, explore_tuning, console, quiet)
+
+
+def _evaluator_for(
+    spec: TuneSpec, workers: Workers, notify: Callable[[str], None]
+) -> AbstractContextManager[Evaluator | None]:
+    """The evaluator of a tuning's designs on workers, None for this process."""
+
+    def make(client: Client) -> Evaluator:
+        from studies.tuning.workers import ClusterEvaluator
+
+        return ClusterEvaluator(client, spec, workers.timeout, notify)
+
+    return on_workers(workers, notify, make)
 
 
 def _audit(spec: TuneSpec, console: Console) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from contextlib import AbstractContextManager
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,7 +11,6 @@ import numpy as np
 from distributed import get_worker
 
 from studies import config
-from studies.cluster.connect import Workers, on_workers
 from studies.cluster.watch import Watch
 from studies.cluster.worker import alone, configure_worker, identity, refuse_difference
 from studies.errors import StudyError
@@ -128,16 +126,3 @@ class ClusterEvaluator(Evaluator):
         finally:
             self._client.cancel(futures)
         return [answers[future].evaluation for future in futures]
-
-
-def evaluator_for(
-    spec: TuneSpec, workers: Workers, notify: Callable[[str], None]
-) -> AbstractContextManager[Evaluator | None]:
-    """The evaluator of a tuning's designs on workers, None for this process.
-
-    Raises:
-        StudyError: as `connected`.
-    """
-    return on_workers(
-        workers, notify, lambda client: ClusterEvaluator(client, spec, workers.timeout, notify)
-    )
