@@ -207,7 +207,7 @@ def explore(
 @app.command()
 def info(as_json: AsJson = False) -> None:
     """Show versions, devices, precision, compilation cache, and what sweeps run with."""
-    start()
+    start(gpu=True)
     from studies.config import info as facts
     from studies.engine.executor import executor_text
 

@@ -12,7 +12,7 @@ import platform
 import re
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -170,17 +170,17 @@ def without_jax_cache() -> Iterator[None]:
         reset_cache()
 
 
-def start(precision: str = "float64", cpu_only: bool = False) -> None:
+def start(precision: str = "float64", gpu: bool = False) -> None:
     """Configure and start JAX, as every computing command does.
 
-    cpu_only: leave GPUs to the workers.
+    gpu: compute on GPUs if JAX finds some; they are worth it for thousands of cases.
 
     Raises StudyError as `configure`, or if JAX cannot start.
     """
     configure(precision)
     import jax
 
-    if cpu_only:
+    if not gpu:
         _settings().update("jax_platforms", "cpu")
     try:
         jax.local_devices()
@@ -243,6 +243,31 @@ def processor() -> str:
     device = jax.local_devices()[0]
     is_cuda = "cuda" in getattr(device.client, "platform_version", "").lower()
     return "cuda" if device.platform == "gpu" and is_cuda else str(device.platform)
+
+
+def hosts() -> list[Any]:
+    """The devices of this machine's cores, also where JAX computes on GPUs; one per core."""
+    import jax
+
+    try:
+        return list(jax.local_devices(backend="cpu"))
+    except RuntimeError:  # JAX_PLATFORMS leaves them out
+        return jax.local_devices()[:1]
+
+
+def device_now() -> Any:
+    """What programs are compiled for here: within `on_host` a core, otherwise JAX's default."""
+    import jax
+
+    return _settings().jax_default_device or jax.local_devices()[0]
+
+
+def on_host() -> AbstractContextManager[Any]:
+    """Programs compiled or called within it are for the cores, also where JAX computes on GPUs."""
+    import jax
+
+    is_host = processor() == "cpu"
+    return nullcontext() if is_host else jax.default_device(hosts()[0])
 
 
 def processor_text() -> str:

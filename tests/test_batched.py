@@ -14,6 +14,7 @@ from studies.engine import function
 from studies.engine.batched import batched
 from studies.errors import StudyError
 from studies.kernels import bridge, native
+from studies.kernels.traced import InputLeaf, trace_loop
 from studies.study.spec import paper_study
 
 STUDY = paper_study().change(
@@ -207,7 +208,7 @@ def test_second_derivatives_are_refused_in_words(smooth, parameters):
 
 def test_lanes_fill_vectors():
     with pytest.raises(ValueError, match="lanes = 3; allowed: multiples of"):
-        bridge.call_of_loop(
-            bridge.trace_loop(lambda *x: x[2], [], [], [bridge.InputLeaf((), True)], float), 5, 3
+        bridge.CpuCall.of_loop(
+            trace_loop(lambda *x: x[2], [], [], [InputLeaf((), True)], float), 5, 3
         ).kernel()
     assert native.this_processor().vector_bytes in (16, 32, 64)

@@ -62,7 +62,7 @@ def test_gradient_figures(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    "arguments", [["pears"], ["--work", "W2"], ["--work", "grad", "--executor", "gpu"]]
+    "arguments", [["pears"], ["--work", "W2"], ["--work", "grad", "--executor", "tpu"]]
 )
 def test_unknown_choices_are_refused(arguments, capsys):
     with pytest.raises(SystemExit, match="2"):

@@ -18,9 +18,10 @@ from studies import config
 from studies.bench.works import METRICS, WORKS
 from studies.engine import function
 from studies.engine.executor import Executor, executor_text
-from studies.engine.function import STEPPERS, stepper
+from studies.engine.function import stepper
 from studies.engine.plan import Layout
-from studies.kernels import gpu, llvm, native
+from studies.kernels import bridge, gpu, llvm, native
+from studies.kernels.differentiable import DifferentiableLoop
 from studies.kernels.traced import InputLeaf, trace_loop
 from studies.study.cases import build_cases, build_structure
 from studies.study.spec import paper_study
@@ -29,29 +30,29 @@ from tests.test_kernel import check_equal, every_operation
 LAYOUT = Layout(devices=1, blocks=2, lanes=gpu.BLOCK)
 
 
-def rehearsed(loop, n_steps, lanes):
-    """Stands in for `gpu.build_kernel`: the same code, one case after the other on this CPU."""
+def rehearsed(call, arrays):
+    """Stands in for a launch: the same code, one case after the other on this CPU."""
     native.initialise()
-    module = gpu.ThreadWriter(loop, n_steps, lanes).write()
+    loop, lanes = call.make(), call.lanes
+    module = gpu.ThreadWriter(loop, call.n_steps, lanes).write()
     target = llvm.binding.Target.from_default_triple().create_target_machine(jit=True, opt=3)
     parsed = llvm.binding.parse_assembly(str(module))
     gpu.optimise(parsed, target)
     engine = llvm.binding.create_mcjit_compiler(parsed, target)
-    state = loop.leaves["state"]
-    count = sum(map(len, loop.leaves.values())) + len(state)
-    prototype = ctypes.CFUNCTYPE(None, ctypes.c_int64, *[ctypes.c_void_p] * count)
+    prototype = ctypes.CFUNCTYPE(
+        None, ctypes.c_int64, *[ctypes.c_void_p] * (len(arrays) + len(call.shapes))
+    )
     case = prototype(engine.get_function_address("case"))
-    shapes = [jax.ShapeDtypeStruct((*leaf.shape, lanes), loop.dtype) for leaf in state]
 
     def on_host(*arrays):
         given = [np.array(x, loop.dtype, order="C") for x in arrays]
-        last = [np.empty(shape.shape, loop.dtype) for shape in shapes]
+        last = [np.empty(shape.shape, loop.dtype) for shape in call.shapes]
         for k in range(lanes):
             case(k, *(x.ctypes.data for x in (*given, *last)))
         assert engine
         return tuple(last)
 
-    return lambda arrays: list(jax.pure_callback(on_host, tuple(shapes), *arrays))
+    return list(jax.pure_callback(on_host, tuple(call.shapes), *arrays, vmap_method="sequential"))
 
 
 def work(name, size=LAYOUT.size):
@@ -74,7 +75,7 @@ def work(name, size=LAYOUT.size):
 @pytest.mark.long  # in short: what is written for the device is valid, below
 @pytest.mark.parametrize("name", ["W1", "W0"])
 def test_gpu_executor_equals_the_traced_kernel(name, monkeypatch):
-    monkeypatch.setattr(gpu, "build_kernel", rehearsed)
+    monkeypatch.setattr(gpu.GpuCall, "__call__", rehearsed)
     structure, cases = work(name)
     executor = Executor(structure, LAYOUT, kind="gpu")
     found = executor.start(cases).wait()
@@ -86,50 +87,48 @@ def test_gpu_executor_equals_the_traced_kernel(name, monkeypatch):
     assert rms.min() > 0 and rms.max() > 1.001 * rms.min()
 
 
-@pytest.mark.long
-def test_wrong_results_are_noticed(monkeypatch):
-    """A kernel that is off by a thousandth is not believed."""
+def test_gradients_equal_those_of_the_traced_kernel(monkeypatch):
+    """Forward and reverse, in several pieces of the run, the last one shorter."""
+    monkeypatch.setattr(gpu.GpuCall, "__call__", rehearsed)
+    monkeypatch.setattr(gpu.GpuCall, "RECORD", 2**14)
+    random, lanes, n = np.random.default_rng(1), gpu.BLOCK, 25
+    shape = (3, 4)
+    constants = [InputLeaf((3,), True, True)]
+    inputs = [InputLeaf((2,), True, True)]
 
-    def wrong(loop, n_steps, lanes):
-        run = rehearsed(loop, n_steps, lanes)
-        return lambda arrays: [1.001 * x for x in run(arrays)]
+    def step(constants, row, state):
+        (x,), (c,), (u,) = state, constants, row
+        return [0.9 * x + c[:, None] * x * u[0] / (1 + x * x) + u[1]]
 
-    monkeypatch.setattr(gpu, "build_kernel", wrong)
-    structure, cases = work("W1")
-    executor = Executor(structure, LAYOUT, kind="gpu")
-    found = executor.start(cases).wait()
-    assert re.fullmatch(
-        rf"{STEPPERS['scan']} \(the GPU kernel differs by 0\.001 from the scan\)",
-        executor.name,
-    )
-    assert np.sum(found.status == status.OK) == LAYOUT.size - 1
+    def value(kind, leaves):
+        given = step, constants, inputs, [InputLeaf(shape, True)], np.float64, n, lanes, kind
+        loop = DifferentiableLoop(*given)
+        return jax.value_and_grad(lambda x: (loop(x)[0] ** 2).sum())(leaves)
+
+    leaves = [
+        random.normal(size=(3, lanes)),
+        random.normal(size=(n, 2, lanes)),
+        random.normal(size=(*shape, lanes)),
+    ]
+    found, wanted = (value(kind, leaves) for kind in (gpu.GpuCall, bridge.CpuCall))
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11 * np.abs(b).max())
+        assert np.abs(b).max() > 0
 
 
 def test_without_the_call_target_the_scan_runs(monkeypatch):
-    """Here XLA knows no call of PTX, as an older or newer one might not."""
-    monkeypatch.setattr(gpu, "JAXLIB", f"{gpu.KNOWN}.2")
+    """Here XLA knows no call of PTX."""
+    monkeypatch.setattr(function, "_FUNCTIONS", {})
     structure, cases = work("W1")
     executor = Executor(structure, LAYOUT, kind="gpu")
     assert executor.start(cases).wait().status[0] == status.OK
     assert "(the GPU kernel failed: " in executor.name
 
 
-def test_with_another_jaxlib_the_scan_runs(monkeypatch):
-    monkeypatch.setattr(gpu, "JAXLIB", "0.11.1")
-    monkeypatch.setattr(function, "_FUNCTIONS", {})
-    structure, cases = work("W1")
-    executor = Executor(structure, LAYOUT, kind="gpu")
-    assert executor.start(cases).wait().status[0] == status.OK
-    assert "is known to run with jaxlib 0.10 only, this is 0.11.1" in executor.name
-
-
 def test_what_sweeps_run_with_is_said(monkeypatch):
     assert "traced kernel, vectors of" in executor_text()
     monkeypatch.setattr("studies.engine.executor.processor", lambda: "cuda")
-    monkeypatch.setattr(gpu, "JAXLIB", f"{gpu.KNOWN}.2")
-    assert "never run on a device" in executor_text()
-    monkeypatch.setattr("studies.engine.executor.is_known", lambda: False)
-    assert executor_text() == "XLA scan"
+    assert executor_text() == "GPU kernel"
     monkeypatch.setattr("studies.engine.executor.is_available", lambda: False)
     assert "needs llvmlite" in executor_text()
 
@@ -170,7 +169,7 @@ def test_every_operation_becomes_ptx(every_loop):
 def test_the_call_is_lowered_for_cuda(every_loop):
     """What JAX hands to XLA: the target's name, the program and the sizes of the launch."""
     lanes = 4 * gpu.BLOCK
-    run = gpu.build_kernel(every_loop, 100, lanes)
+    run = gpu.GpuCall.of_loop(every_loop, 100, lanes)
     shapes = [(3, 4, lanes), (100, 1), (3, 4, lanes)]
     arrays = [jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes]
     text = jax.jit(run).trace(arrays).lower(lowering_platforms=("cuda",)).as_text()

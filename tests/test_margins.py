@@ -288,7 +288,7 @@ def test_scan_gives_the_same_as_kernels(monkeypatch):
     assert np.sum(is_single) > 3
     loops = loops._replace(cases=jax.tree.map(lambda x: x[is_single], loops.cases))
     kernels = judge_loops(*loops)
-    monkeypatch.setattr(lanes, "_has_kernels", lambda: False)
+    monkeypatch.setattr(lanes, "is_available", lambda: False)
     lanes._runner.cache_clear()
     scanned = judge_loops(*loops)
     lanes._runner.cache_clear()

@@ -105,7 +105,7 @@ def weights(metrics, random):
 @pytest.mark.long  # in short: the reverse of a loop below, and gradients of tunings
 def test_kernel_and_scan_agree(chunk, monkeypatch):
     structure, cases, parameters = chunk
-    monkeypatch.setattr(bridge, "RECORD", 2**18)  # several pieces, the last one shorter
+    monkeypatch.setattr(bridge.CpuCall, "RECORD", 2**18)  # several pieces, the last one shorter
     monkeypatch.setattr(function, "_FUNCTIONS", {})
     fast, slow = (
         Executor(structure, LAYOUT, place=place, kind=kind).differentiate(cases, parameters)

@@ -36,7 +36,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
                 f"--precision {precision}: not allowed with peers, which run W0 in double "
                 "precision; leave it out"
             )
-        start(precision)
+        start(precision, gpu=True)
         from studies.bench.run import run_bench
 
         figures = run_bench(what, work, executor, batch, cases)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -69,18 +69,17 @@ METRICS = {"W0": ("residual_rms",)}
 REPEATS = 5
 
 
-def check_executor(executor: str, allowed: Iterable[str] = STEPPERS) -> None:
+def check_executor(executor: str) -> None:
     """Reject an executor that is unknown or cannot run here.
 
     Args:
-        executor: name, or "".
-        allowed: available names.
+        executor: key of STEPPERS, or "".
 
     Raises:
         StudyError: if so.
     """
-    if executor and executor not in allowed:
-        raise field_error("--executor", executor, ", ".join(map(repr, allowed)))
+    if executor and executor not in STEPPERS:
+        raise field_error("--executor", executor, ", ".join(map(repr, STEPPERS)))
     if executor in ("kernel", "gpu") and not is_available():
         raise StudyError(f"--executor {executor}: needs the package llvmlite")
     if executor == "gpu" and config.processor() != "cuda":

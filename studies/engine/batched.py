@@ -22,7 +22,7 @@ from studies.engine.function import BlockFunction, fastest_function
 from studies.engine.plan import STATIC, lane_unit, padded_rows
 from studies.engine.preflight import check_run
 from studies.errors import StudyError
-from studies.kernels import bridge
+from studies.kernels.differentiable import outside
 from studies.study.cases import case_of, with_used
 from studies.study.numbers import Numbers, one_study, position, put
 from studies.study.paths import known_field, overlaps
@@ -139,7 +139,7 @@ def _batch_program(
     def run(parameters: Array) -> Result:
         n = len(parameters)
         rows = padded_rows(n, lane_unit())
-        one_block = bridge.outside(function, len(rows), parameters.shape[1])
+        one_block = outside(function, len(rows), parameters.shape[1])
         return jax.tree.map(lambda x: x[:n], one_block(parameters[rows], []))
 
     return run

@@ -31,8 +31,9 @@ from studies.config import is_keeping, processor
 from studies.engine.programs import is_plain, kept_data, program
 from studies.errors import NoKernelError, warn_of_scan
 from studies.kernels import bridge, gpu, llvm, native
+from studies.kernels.differentiable import DifferentiableLoop
 from studies.kernels.equations import Function, call_of, literal, trace
-from studies.kernels.traced import InputLeaf, trace_loop
+from studies.kernels.traced import InputLeaf
 
 #: How often the steps were traced in this process; tests use it to count compilations.
 TRACES: list[Structure] = []
@@ -173,7 +174,7 @@ class BlockFunction:
     def operations(self) -> Counter[str]:
         """Operations of one sample by kind, if a kernel runs on this processor."""
         steps = self._step_all
-        if not isinstance(steps, bridge.DifferentiableLoop):
+        if not isinstance(steps, DifferentiableLoop):
             return Counter()
         return steps.plain.operations()
 
@@ -184,17 +185,11 @@ class BlockFunction:
         name = (
             sha256(repr(self._names).encode()).hexdigest() if self._names and is_keeping() else ""
         )
-        return bridge.DifferentiableLoop(*arguments, name)
+        return DifferentiableLoop(*arguments, bridge.CpuCall, name)
 
-    def _gpu(self) -> Callable[[Any], list[Any]]:
-        if not gpu.is_known():
-            raise NoKernelError(
-                f"the GPU kernel is known to run with jaxlib {gpu.KNOWN} only, this is {gpu.JAXLIB}"
-            )
-        loop = trace_loop(*self.loop_arguments(), _real())
-        if loop.operations()["tanh"]:
-            raise NoKernelError("the GPU kernel does not support tanh, which friction needs")
-        return gpu.build_kernel(loop, self.structure.n_steps, self.lanes)
+    def _gpu(self) -> Callable[[list[Any]], list[Any]]:
+        arguments = *self.loop_arguments(), _real(), self.structure.n_steps, self.lanes
+        return DifferentiableLoop(*arguments, gpu.GpuCall)
 
     def _scan(self, start: Start, first: State) -> State:
         """Cases along the last axis; XLA fuses little of a step under `vmap`."""
@@ -284,7 +279,7 @@ class BlockFunction:
         return result
 
     def _note_run(self, began: float) -> None:
-        if isinstance(self._step_all, bridge.DifferentiableLoop):
+        if isinstance(self._step_all, DifferentiableLoop):
             self._step_all.note_run(time.perf_counter() - began)
 
     def _program(

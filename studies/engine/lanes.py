@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from studies.config import processor
+from studies.config import on_host
 from studies.engine.plan import lane_unit
 from studies.errors import NoKernelError, warn_of_scan
 from studies.kernels import cpu
@@ -50,7 +50,7 @@ def run_steps(
             tuple(leaf.shape[:-1] for leaf in parts[2][0]),
         )
     # whole vectors; whole blocks for XLA, which compiles each size separately
-    more = -lanes % (lane_unit() if _has_kernels() else BLOCK)
+    more = -lanes % (lane_unit() if is_available() else BLOCK)
 
     def filled(x: Any, is_wide: bool = True) -> np.ndarray:
         x = np.asarray(x)
@@ -71,10 +71,6 @@ def run_steps(
 _TRACING = Lock()
 
 
-def _has_kernels() -> bool:
-    return processor() == "cpu" and is_available()
-
-
 @lru_cache(maxsize=32)
 def _runner(
     step: Callable[..., Any],
@@ -89,7 +85,7 @@ def _runner(
     def flat(*parts: list[Any]) -> list[Any]:
         return jax.tree.leaves(step(*map(jax.tree.unflatten, trees, parts)))
 
-    if _has_kernels():
+    if is_available():
         real = jax.dtypes.canonicalize_dtype(np.float64)
 
         def make() -> TracedLoop:
@@ -124,6 +120,7 @@ def _runner(
 
     def run_scan(leaves: list[Any], n_steps: int, lanes: int) -> list[Any]:
         constants, inputs = leaves[: sizes[0]], leaves[sizes[0] : sizes[0] + sizes[1]]
-        return list(map(np.asarray, scanned(constants, inputs, leaves[-sizes[2] :], n_steps)))
+        with on_host():
+            return list(map(np.asarray, scanned(constants, inputs, leaves[-sizes[2] :], n_steps)))
 
     return run_scan

@@ -40,6 +40,7 @@ from jaxmodel.return_difference import (
     loop_strength,
 )
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
+from studies.config import hosts
 from studies.engine.damping import damping_ratios, least_controlled
 from studies.engine.lanes import BLOCK, run_steps
 from studies.engine.programs import kept_jit
@@ -116,7 +117,7 @@ def judge_loops(structure: Structure, cases: Case) -> LoopFigures:
     whole = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape[1:])), cases)
     # idle links cost nothing; one number for all cases, since each number has its own programs
     most = max(1, int(np.sum(whole.control.link_mask > 0, axis=1).max()))
-    threads = len(jax.local_devices())
+    threads = len(hosts())
     with ThreadPoolExecutor(threads) as pool:
 
         def judge(rows: np.ndarray, sweep: FrequencySweep) -> np.ndarray:

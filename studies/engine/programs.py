@@ -28,7 +28,7 @@ import numpy as np
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
 from studies import sources
-from studies.config import is_keeping, processor_text, without_jax_cache
+from studies.config import device_now, is_keeping, on_host, processor_text, without_jax_cache
 from studies.kernels import native
 from studies.kernels.compilation import ObjectCache
 from studies.space.free import Placing
@@ -42,7 +42,7 @@ _PROGRAMS: dict[str, Any] = {}
 
 
 class KeptFunction:
-    """A function whose programs are kept, made by `kept_jit`."""
+    """A function whose programs are kept, made by `kept_jit`; they run on this machine's cores."""
 
     def __init__(
         self,
@@ -58,9 +58,12 @@ class KeptFunction:
     def __call__(self, *arguments: Any) -> Any:
         fixed, free = self._split(arguments)
         is_traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(free))
-        if is_traced or not self._is_kept(fixed):
+        if is_traced:
             return self._jit(*arguments)
-        return self._kept(fixed, free, arguments)(*free)
+        with on_host():
+            if not self._is_kept(fixed):
+                return self._jit(*arguments)
+            return self._kept(fixed, free, arguments)(*free)
 
     def program(self, *arguments: Any) -> Callable[..., Any]:
         """The program for arguments like these, a function of those that are not static.
@@ -69,8 +72,9 @@ class KeptFunction:
         """
         fixed, free = self._split(arguments)
         if not self._is_kept(fixed):
-            return lambda *free: self._jit(*self._join(fixed, free))
-        return self._kept(fixed, free, arguments)
+            return lambda *free: self(*self._join(fixed, free))
+        with on_host():
+            return self._kept(fixed, free, arguments)
 
     def _is_kept(self, fixed: list[Any]) -> bool:
         return is_keeping() and all(map(is_plain, fixed))
@@ -92,7 +96,7 @@ class KeptFunction:
 def kept_jit(
     static_argnums: int | tuple[int, ...] = (), compiler_options: dict[str, Any] | None = None
 ) -> Callable[[Callable[..., Any]], KeptFunction]:
-    """`jax.jit` whose programs are kept.
+    """`jax.jit` whose programs are kept, and run on this machine's cores: GPUs are for many cases.
 
     Args:
         static_argnums: arguments that are part of the program. With others than numbers, texts,
@@ -130,7 +134,8 @@ def program(names: list[Any], arguments: list[Any], lower: Callable[[], Any]) ->
         The program, a function of `arguments`.
     """
     leaves, tree = jax.tree.flatten(arguments)
-    name = repr((names, tree, [str(jax.typeof(x)) for x in leaves], is_keeping()))
+    shapes = [str(jax.typeof(x)) for x in leaves]
+    name = repr((names, tree, shapes, str(device_now()), is_keeping()))
     with _LOCK:
         if name not in _PROGRAMS:
             _PROGRAMS[name] = _load_or_compile(name, lower)
@@ -220,8 +225,7 @@ def _load(content: bytes) -> Any:
         _initialise_lapack()
         payload, *examples = pickle.loads(content)
         in_tree, out_tree = map(jax.tree.structure, examples)
-        devices = jax.local_devices()[:1]
-        return deserialize_and_load(payload, in_tree, out_tree, execution_devices=devices)
+        return deserialize_and_load(payload, in_tree, out_tree, execution_devices=[device_now()])
     except Exception:  # whatever a newer jaxlib raises: the cache only saves time
         return None
 

@@ -23,6 +23,7 @@ from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.return_difference import assembled_modes
 from jaxmodel.robustness import MarginPlace, norm_peaks
+from studies.config import hosts
 from studies.engine.crossings import delay_margins, phase_margins
 from studies.engine.disk_margin import LARGEST, disk_margins
 from studies.engine.loop_gain import LoopGains, acting_commands, loop_gains
@@ -97,7 +98,7 @@ def _figures_of(
         margins = {name: place.value for name, place in places.items()}
         return margins | _peaks_of(response, tuple(x for x in names if x in PEAKS))
 
-    with threadpool_limits(1, "blas"), ThreadPoolExecutor(len(jax.local_devices())) as pool:
+    with threadpool_limits(1, "blas"), ThreadPoolExecutor(len(hosts())) as pool:
         judged = list(pool.map(judge, parts))
     return {name: np.concatenate([part[name] for part in judged])[:count] for name in names}
 

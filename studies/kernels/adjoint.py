@@ -24,10 +24,6 @@ from studies.kernels.traced import (
     reads_of,
 )
 
-#: Largest record of a block of lanes [bytes]. A run is reversed in pieces whose records stay in the
-#: cache; stepping each piece again costs less than keeping all records in memory.
-RECORD = 2 * 2**20
-
 
 class Adjoint(NamedTuple):
     """A loop and its reverse.

@@ -10,69 +10,60 @@ nine minutes (docs/performance.md).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxlib import version as jaxlib_version
 
+from studies.errors import NoKernelError
 from studies.kernels.compilation import compiling
+from studies.kernels.differentiable import LoopCall
 from studies.kernels.llvm import Arguments, Writer, binding, ir
 from studies.kernels.traced import TracedLoop
 
 #: Cases per thread block: two warps, so that registers are allocated in small portions.
 BLOCK = 64
-#: XLA's name for a call of a PTX program, and the versions of jaxlib that are known to have it.
-TARGET, KNOWN = "__gpu$xla.gpu.ptx", "0.10"
-JAXLIB: str = jaxlib_version.__version__
+#: XLA's name for a call of a PTX program.
+TARGET = "__gpu$xla.gpu.ptx"
 #: The oldest GPUs the PTX supports; the driver compiles it for the actual one.
 _ARCHITECTURE, _PTX = "sm_70", "+ptx63"
 _TRIPLE = "nvptx64-nvidia-cuda"
 
 
-def is_known() -> bool:
-    """Whether this version of jaxlib calls PTX programs as this module expects."""
-    return JAXLIB.startswith(f"{KNOWN}.")
+class GpuCall(LoopCall):
+    """A call of a kernel for a GPU, a launch of one thread per case."""
 
+    RECORD = 2**31
 
-def build_kernel(
-    loop: TracedLoop, n_steps: int, lanes: int
-) -> Callable[[Sequence[Any]], list[Any]]:
-    """A JAX function of the loop's arrays that returns the state after the last sample.
+    @staticmethod
+    def has_routines() -> bool:
+        return False
 
-    Args:
-        loop: from `trace_loop`.
-        n_steps: samples.
-        lanes: cases side by side, a multiple of BLOCK.
+    def prepare(self) -> None:
+        if self.make().operations()["tanh"]:
+            raise NoKernelError("the GPU kernel does not support tanh, which friction needs")
 
-    Returns:
-        A function of arrays as for `studies.kernels.cpu.Kernel.run`; it can be part of a compiled
-        program.
-    """
-    source = write_ptx(loop, n_steps, lanes)
-    state = loop.leaves["state"]
-    call = jax.ffi.ffi_call(
-        TARGET, [jax.ShapeDtypeStruct((*leaf.shape, lanes), loop.dtype) for leaf in state]
-    )
-    sizes = {"grid_x": lanes // BLOCK, "block_x": BLOCK, "shared_mem_bytes": 0}
-    sizes |= dict.fromkeys(("grid_y", "grid_z", "block_y", "block_z"), 1)
-    numbers = {name: np.int32(size) for name, size in sizes.items()}
+    def note_run(self, seconds: float) -> None:
+        pass
 
-    def run(arrays: Sequence[Any]) -> list[Any]:
-        inputs = [jnp.asarray(x, loop.dtype) for x in arrays]
+    def __call__(self, arrays: Sequence[Any]) -> list[Any]:
+        call = jax.ffi.ffi_call(TARGET, self.shapes, vmap_method="sequential")
+        sizes = {"grid_x": self.lanes // BLOCK, "block_x": BLOCK, "shared_mem_bytes": 0}
+        sizes |= dict.fromkeys(("grid_y", "grid_z", "block_y", "block_z"), 1)
+        numbers = {name: np.int32(size) for name, size in sizes.items()}
+        source = write_ptx(self.make(), self.n_steps, self.lanes)
+        inputs = [jnp.asarray(x, self.dtype) for x in arrays]
         return list(call(*inputs, name="run", kernel_type="ptx", kernel_data=source, **numbers))
-
-    return run
 
 
 def write_ptx(loop: TracedLoop, n_steps: int, lanes: int) -> str:
-    """The loop as a program in PTX with one entry `run(leaves..., last state...)`.
+    """The loop as a program in PTX with one entry `run(leaves..., last state..., records...)`.
 
     Args:
-        loop, n_steps, lanes: as in `build_kernel`.
+        loop, n_steps, lanes: as in `LoopCall.of_loop`.
     """
     _initialise()
     module = ThreadWriter(loop, n_steps, lanes).write()
@@ -99,14 +90,16 @@ def optimise(module: Any, target: Any) -> None:
 
 
 class ThreadWriter(Writer):
-    """Writes `case(first, leaves..., last state...)`, the run of one case."""
+    """Writes `case(first, leaves..., last state..., records...)`, the run of one case."""
 
     def __init__(self, loop: TracedLoop, n_steps: int, lanes: int) -> None:
         super().__init__(loop, 1)
         self._n_steps, self._lanes = n_steps, lanes
 
     def open(self) -> Arguments:
-        kinds = {**self.loop.leaves, "result": self.loop.leaves["state"]}
+        leaves = self.loop.leaves
+        kinds = {kind: leaves[kind] for kind in ("constant", "input", "state")}
+        kinds |= {"result": leaves["state"], "record": leaves.get("record", [])}
         count = sum(map(len, kinds.values()))
         signature = ir.FunctionType(ir.VoidType(), [self.index, *[ir.PointerType()] * count])
         function = ir.Function(self.module, signature, "case")

@@ -64,7 +64,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             raise StudyError("--json: for --dry-run only; the results: studies show DIR --json")
         if out is not None and not dry_run:
             refuse_existing(out, SWEEPS, resume)
-        start(precision, cpu_only=workers.are_named)
+        start(precision, gpu=not workers.are_named)
         from studies.engine.progress import Phases, duration_text
         from studies.engine.sweep import make_plan, run_sweep, sweep_phases
         from studies.space.spec import load_sweep

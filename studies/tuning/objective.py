@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +10,7 @@ import numpy as np
 
 from jaxmodel.metrics import Metrics
 from jaxmodel.parameters import Array
+from studies.engine.programs import kept_jit
 from studies.study.entries import parse_entries
 from studies.tuning.spec import BASELINE, LOWER, Family, TuneSpec
 
@@ -134,7 +134,7 @@ def judge_design(
     return jnp.sum(-jnp.sort(-each) * weights), excess, jnp.max(peaks, axis=0)
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(static_argnums=0)
 def judge_designs(
     goal: Objective, designs: ScenarioFigures, baseline: ScenarioFigures, allowed: Array
 ) -> tuple[Array, Array, Array]:
@@ -151,7 +151,7 @@ class JudgedDesigns(NamedTuple):
     cotangents: ScenarioFigures  # of objective and limits, (1 + m, designs, S, ...)
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(static_argnums=0)
 def judge_with_cotangents(
     goal: Objective, designs: ScenarioFigures, baseline: ScenarioFigures, allowed: Array
 ) -> JudgedDesigns:
