@@ -176,6 +176,42 @@ def delayed_loop(
     return matrices.open + matrices.feedback
 
 
+class DelayedParts(NamedTuple):
+    """What the transition of a closed loop over a sample is made of, as far as its delay matters.
+
+    The state begins with that of plant and electronics, then commands on their way, u_(k-2) to
+    u_(k-LONGEST).
+    """
+
+    matrix: Array  # transition at the delay of the case, (m, m)
+    state: Array  # A of plant and electronics, (n, n)
+    enters: Array  # B of commands, (n, 3 K)
+    commands: Array  # place of every command u_(k-1) in the state, (3 K,), integers
+
+
+def delayed_parts(structure: Structure, case: Case, pose: Array, law: Controller) -> DelayedParts:
+    """Parts of a loop to which a further delay can be given; arguments as `delayed_loop`."""
+    late = structure._replace(has_delay=True)
+    smooth, drive = late._replace(is_smooth=True, feedback="sampled"), DRIVES[structure.drive]
+    matrices = closed_loop(late, case, pose, law)
+    plant = linearise(
+        smooth, prepare(smooth, case).loop, pose, resting(late, case), drive.is_sampled
+    )
+    analogue = analogue_plant(smooth, plant, case)
+    from jax.flatten_util import ravel_pytree
+
+    n, n_sensors = len(analogue.state), 3 * structure.n_patches
+    rest, unpack = ravel_pytree(rest_controller(law))
+    first = n + (LONGEST - 1) * n_sensors
+    places = unpack(jnp.arange(rest.size, dtype=rest.dtype)).voltage
+    return DelayedParts(
+        matrix=matrices.open + matrices.feedback,
+        state=analogue.state,
+        enters=analogue.enters[:, :n_sensors],
+        commands=first + jnp.ravel(places).astype(int),
+    )
+
+
 class SampledPlant(NamedTuple):
     """What a controller acts on: x[k+1] = A x[k] + B u[k], y[k] = C x[k], over one sample.
 

@@ -18,7 +18,7 @@ from jaxmodel.linear import linearise, resting
 from jaxmodel.loop_figures import MARGINS, MOST_DELAY, PEAKS, guaranteed_range
 from jaxmodel.prepare import prepare
 from jaxmodel.robustness import margin_at, norm_peaks, search_frequencies
-from jaxmodel.sampled_loop import analogue_plant, closed_loop
+from jaxmodel.sampled_loop import analogue_plant, closed_loop, delayed_loop
 from jaxmodel.scaling import best_scaling
 from studies.engine import diagonal_scaling
 from studies.engine.loop_gain import loop_gains
@@ -233,6 +233,64 @@ def test_a_delay_margin_is_not_that_of_a_steep_slope_of_the_gain(factor):
     loop = loop_of("plain", "lqr", factor)
     late = margins_of(loop)["delay_margin"]
     assert delayed(loop, 0.99 * late) < 1 < delayed(loop, 1.01 * late)
+
+
+#: Designs whose links are nearly alike, so that eigenvalues of L nearly coincide; images of the
+#: spectrum add up at other delays than at none.
+ALIKE = {
+    "neighbours": {
+        "control__gain_factor": 0.2010975344982944,
+        "machine__platform_mass": 0.2813991557922606,
+        "electronics__antialias_hz": 4724.87507922483,
+        "electronics__lowpass_ratio": [5.81108854, 1.58272912, 3.30750442],
+        "electronics__highpass_hz": 133.40043867294227,
+        "link__length": 0.17811059287295394,
+        "link__damping_ratio": 0.001236226043434794,
+        "drive__kp": 32480.75249726945,
+    },
+    "many crossings": {
+        "control__law": "lqr",
+        "control__gain_factor": 0.9530697938156152,
+        "machine__platform_mass": 0.38166378484716545,
+        "electronics__antialias_hz": 3316.79807931698,
+        "electronics__highpass_hz": 138.9141974011503,
+        "electronics__delay": 0.5,
+        "link__length": 0.1754332135033722,
+        "link__damping_ratio": 0.0023865921887462997,
+        "drive__kp": 30465.015658572185,
+    },
+    "weak at once": {
+        "control__gain_factor": 1.1952392952374062,
+        "machine__platform_mass": 0.23304786297844768,
+        "electronics__antialias_hz": 1954.2572420324022,
+        "electronics__highpass_hz": 144.71568557315203,
+        "electronics__delay": 0.25,
+        "link__length": 0.17788684169120353,
+        "link__damping_ratio": 0.0013903190431939726,
+        "drive__kp": 26447.14684709405,
+    },
+}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=pytest.mark.long if k else []) for k, x in enumerate(ALIKE)]
+)
+def test_no_delay_margin_is_missed(name):
+    study = STUDY.change(link__modes=3, **ALIKE[name])
+    structure = build_structure(study)
+    cases = jax.tree.map(lambda x: x[None], as_arrays(build_case(study)))
+    found = judge_robustness(structure, cases, ("delay_margin",), np.array([2.0]))
+    structure, cases = with_margin_modes(structure, cases)
+    case = jax.tree.map(lambda x: x[0], cases)
+    law = prepare(structure, case).loop.controller
+
+    @jax.jit
+    def late(delay):
+        return delayed_loop(structure, case, case.path.waypoints[0], law, delay)
+
+    margin = found["delay_margin"][0]
+    radii = [radius(np.asarray(late(margin * x))) for x in np.linspace(0.04, 0.99, 20)]
+    assert max(radii) < 1 < radius(np.asarray(late(1.01 * margin)))
 
 
 def smallest_norm(matrix: np.ndarray) -> float:

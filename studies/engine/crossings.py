@@ -16,7 +16,7 @@ import numpy as np
 from jaxmodel.loop_figures import MOST_DELAY, MOST_PHASE
 from jaxmodel.robustness import MarginPlace
 from studies.engine.loop_gain import LoopGains
-from studies.engine.margin_grid import GridGain
+from studies.engine.margin_grid import GridGain, perron_radius
 
 #: Eigenvalues are computed where they can be at least this [1].
 STRONG = 0.9
@@ -29,9 +29,9 @@ PEAKS = 4
 SLIGHT = 0.01
 #: Points between neighbouring frequencies where a crossing is looked at again, and how much later
 #: than the first ones may be, as a factor.
-BETWEEN, LATER = 6, 1.4
+BETWEEN, LATER = 6, 10.0
 #: Places per loop that are solved for, steps at most, and the residual that ends them.
-SOLVED, STEPS, RESIDUAL = 3, 8, 1e-9
+SOLVED, STEPS, RESIDUAL = 12, 8, 1e-9
 
 
 class _Places(NamedTuple):
@@ -74,7 +74,10 @@ def phase_margins(loops: LoopGains, grid: GridGain) -> MarginPlace:
 
 def delay_margins(loops: LoopGains, grid: GridGain) -> MarginPlace:
     """Smallest common further delay that makes stable loops unstable [samples], (n,) each."""
-    omega, gain, at_once = _searched(loops, grid)
+    # images that add up at once may cancel later, and the other way round
+    turned = loops.at_delay(grid.omega, np.full(grid.omega.shape, 0.5))
+    later = grid._replace(radius=np.maximum(grid.radius, perron_radius(turned)))
+    omega, gain, at_once = _searched(loops, later)
     n = len(omega)
     angle = omega * loops.plant.period[:, None]
     half = loops.at_delay(omega, np.full(omega.shape, 0.5))

@@ -25,6 +25,7 @@ from jaxmodel.return_difference import assembled_modes
 from jaxmodel.robustness import MarginPlace, norm_peaks
 from studies.config import hosts
 from studies.engine.crossings import delay_margins, phase_margins
+from studies.engine.delay_check import checked_delays
 from studies.engine.disk_margin import LARGEST, disk_margins
 from studies.engine.loop_gain import LoopGains, acting_commands, loop_gains
 from studies.engine.margin_grid import GridGain, search_grid
@@ -96,6 +97,9 @@ def _figures_of(
         response, modes = _responses(structure, jax.tree.map(lambda x: x[part], whole))
         places = find_margins(response, modes, tuple(x for x in names if x in MARGINS))
         margins = {name: place.value for name, place in places.items()}
+        if "delay_margin" in margins and not LAWS[structure.law].is_switching:
+            alone = jax.tree.map(lambda x: x[part], whole)
+            margins["delay_margin"] = checked_delays(structure, alone, margins["delay_margin"])
         return margins | _peaks_of(response, tuple(x for x in names if x in PEAKS))
 
     with threadpool_limits(1, "blas"), ThreadPoolExecutor(len(hosts())) as pool:

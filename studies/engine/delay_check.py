@@ -1,0 +1,155 @@
+"""Delay margins checked by eigenvalues of the delayed loop, which know nothing of their search.
+
+The search follows eigenvalues of the loop gain over frequency and delay. Where links are nearly
+alike it can take one for another, or miss one, and a margin comes out wrong; the poles of the
+closed loop at some delays, exact for held commands, show that.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.delay import LONGEST, true_delay
+from jaxmodel.prepare import prepare
+from jaxmodel.sampled_loop import RADIUS_TOLERANCE, DelayedParts, delayed_parts
+from studies.engine.programs import kept_jit
+
+#: Shares of a delay margin at which the loop must be stable, and one at which it must not be.
+BEFORE, BEYOND = (0.35, 0.7, 0.98), 1.02
+#: Delays at which the loop is looked at again if one of these is wrong, and steps of the false
+#: position from there (Illinois).
+LEVELS, STEPS = 24, 8
+
+
+def checked_delays(structure: Structure, cases: Case, delay: np.ndarray) -> np.ndarray:
+    """Delay margins, those that turn out wrong replaced by the edge that poles show.
+
+    Args:
+        structure: of loops that are stable as they are, with the plant modes of margins.
+        cases: leaves (n, ...), n as `studies.engine.robustness.BATCH`.
+        delay: as searched, NaN where there is none [samples], (n,).
+
+    Returns:
+        Delay margins, within 2 % or, where replaced, 1e-3 of them [samples], (n,). Delays beyond
+        `jaxmodel.delay.LONGEST` in all are not looked at: a margin seen nowhere before is `delay`,
+        or that delay if it is larger.
+    """
+    own = np.asarray(true_delay(cases.electronics))
+    loops = DelayedLoops.of(_parts(structure, cases), np.asarray(cases.electronics.period), own)
+    return np.array([_checked(loops, k, x, LONGEST - own[k]) for k, x in enumerate(delay)])
+
+
+def _checked(loops: DelayedLoops, k: int, delay: float, room: float) -> float:
+    end = min(delay, room)
+    if not end > 0 or not loops.is_finite[k]:
+        return delay
+    is_stable = all(loops.growth(k, end * x) <= RADIUS_TOLERANCE for x in BEFORE)
+    if is_stable and (delay >= room or loops.growth(k, min(delay * BEYOND, room)) > 0):
+        return delay
+    edge = _first_edge(loops, k, room if is_stable else end)
+    return edge if edge is not None else max(delay, room) if is_stable else delay
+
+
+def _first_edge(loops: DelayedLoops, k: int, last: float) -> float | None:
+    """Shortest delay up to `last` at which a loop is unstable [samples]; None: none is seen."""
+    levels = last * np.arange(LEVELS + 1) / LEVELS
+    growth = np.array([loops.growth(k, x) for x in levels])
+    unstable = np.flatnonzero(growth > RADIUS_TOLERANCE)
+    first = unstable[0] if len(unstable) else LEVELS
+    # a peak between two levels may reach further
+    for j in range(1, first):
+        if growth[j] >= max(growth[j - 1], growth[j + 1]):
+            found = minimize_scalar(
+                lambda x: -loops.growth(k, x),
+                bounds=(levels[j - 1], levels[j + 1]),
+                method="bounded",
+                options={"maxiter": STEPS},
+            )
+            if -found.fun > RADIUS_TOLERANCE:
+                return _edge(loops, k, levels[j - 1], float(found.x))
+    return _edge(loops, k, levels[first - 1], levels[first]) if len(unstable) else None
+
+
+def _edge(loops: DelayedLoops, k: int, lower: float, upper: float) -> float:
+    """Delay between two at which a loop becomes unstable [samples]."""
+    at_lower, at_upper = loops.growth(k, lower), loops.growth(k, upper)
+    for _ in range(STEPS):
+        if at_upper <= at_lower:
+            break
+        middle = upper - at_upper * (upper - lower) / (at_upper - at_lower)
+        now = loops.growth(k, middle)
+        if now > 0:
+            upper, at_upper, at_lower = middle, now, at_lower / 2
+        else:
+            lower, at_lower, at_upper = middle, now, at_upper / 2
+    return lower
+
+
+class DelayedLoops(NamedTuple):
+    """Loops whose commands can come later, NumPy; n of them."""
+
+    parts: DelayedParts
+    period: np.ndarray  # [s], (n,)
+    own: np.ndarray  # delay of each [samples], (n,)
+    pole: np.ndarray  # of plant and electronics [rad/s], (n, a)
+    shape: np.ndarray  # their eigenvectors, (n, a, a)
+    enters: np.ndarray  # commands in coordinates of these, (n, a, 3 K)
+    is_finite: np.ndarray  # (n,)
+
+    @classmethod
+    def of(cls, parts: DelayedParts, period: np.ndarray, own: np.ndarray) -> DelayedLoops:
+        parts = jax.tree.map(np.asarray, parts)
+        is_finite = np.array([np.isfinite(x).all() for x in parts.matrix])
+        state = np.where(is_finite[:, None, None], parts.state, np.eye(parts.state.shape[1]))
+        pole, shape = np.linalg.eig(state + 0j)
+        enters = np.linalg.solve(shape, np.where(np.isfinite(parts.enters), parts.enters, 0.0))
+        return cls(parts, period, own, pole, shape, enters, is_finite)
+
+    def growth(self, k: int, delay: float) -> float:
+        """Logarithm of the spectral radius of loop k with a further delay [samples]."""
+        matrix = self.parts.matrix[k].copy()
+        n = len(self.pole[k])
+        matrix[:n] += self._commands(k, self.own[k] + delay) - self._commands(k, self.own[k])
+        return float(np.log(np.abs(np.linalg.eigvals(matrix)).max()))
+
+    def _commands(self, k: int, delay: float) -> np.ndarray:
+        """Next state of plant and electronics by commands, now or earlier, (a, m)."""
+        matrix, commands = self.parts.matrix[k], self.parts.commands[k]
+        n, n_sensors = self.enters[k].shape
+        whole = max(int(np.ceil(delay)), 1)
+        share = delay - (whole - 1)
+        rest = (1 - share) * self.period[k]
+        after = self._held(k, rest)
+        before = self._held(k, share * self.period[k], np.exp(self.pole[k] * rest))
+        places = [None, commands]  # of u_(k), u_(k-1) and those on their way
+        places += [n + j * n_sensors + np.arange(n_sensors) for j in range(LONGEST - 1)]
+        found = np.zeros((n, len(matrix)))
+        for number, gain in ((whole, before), (whole - 1, after)):
+            if number:
+                found[:, places[number]] += gain
+            else:
+                found += gain @ matrix[commands]
+        return found
+
+    def _held(self, k: int, time: float, then: np.ndarray | float = 1.0) -> np.ndarray:
+        """Change of plant and electronics by commands held over a time [s], (a, 3 K)."""
+        pole = self.pole[k]
+        moved = np.where(
+            np.abs(pole) > 0, np.expm1(pole * time) / np.where(pole == 0, 1, pole), time
+        )
+        return np.real(self.shape[k] * (moved * then) @ self.enters[k])
+
+
+# compiled without optimisation: it takes a fraction of the time
+@kept_jit(static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})
+def _parts(structure: Structure, cases: Case) -> DelayedParts:
+    def one(case: Case) -> DelayedParts:
+        law = prepare(structure, case).loop.controller
+        return delayed_parts(structure, case, case.path.waypoints[0], law)
+
+    return jax.vmap(one)(cases)
