@@ -201,8 +201,8 @@ def metric_values(data: SweepData, name: str) -> np.ndarray:
 
     A metric or condition number with more axes counts with its largest value over the links that
     any case controls: `residual_rms` is that of the worst link and its worst station,
-    `residual_rms[link=3]` that of the worst station of link 3, controlled or not. Indices without
-    a name count from 0. A field that does not vary has the same value in every case.
+    `residual_rms[link=3]` that of the worst station of link 3, controlled or not. Of poses, x and y
+    count; `pose_error_peak[2]` is the angle. Indices without a name count from 0. A field that does not vary has the same value in every case.
 
     Raises:
         StudyError: unknown name or entry.
@@ -295,6 +295,8 @@ def _worst(
     """Largest, or least, value of each case over the links that count, (n,)."""
     if array.ndim == 1:
         return array
+    if "pose_axis" in dims:  # the angle has another unit
+        array = np.take(array, (0, 1), axis=dims.index("pose_axis"))
     if array.dtype.kind == "f" and "link" in dims:
         shape = [3 if d == "link" else 1 for d in dims]
         array = np.where(np.reshape(counted_links(data), shape), array, np.nan)

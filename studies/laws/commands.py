@@ -36,7 +36,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         ] = False,
         quiet: Annotated[bool, typer.Option("--quiet", help="hide progress")] = False,
     ) -> None:
-        """Compare control laws and drives, each tuned to one budget, on machines they never saw."""
+        """Compare control laws and drives, each tuned to one budget, on machines they never saw.
+
+        Takes about 20 minutes on two cores; --resume continues an interrupted comparison.
+        """
         from studies.engine.folder import COMPARISONS, refuse_existing
 
         refuse_existing(out, COMPARISONS, resume)

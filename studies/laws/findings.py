@@ -15,7 +15,7 @@ from studies.errors import StudyError
 from studies.export.cost import products_of
 from studies.laws.candidates import AS_GIVEN
 from studies.laws.judging import FIGURES, Judged, changes
-from studies.laws.ranking import RESAMPLES, Ranking, rank
+from studies.laws.ranking import RESAMPLES, Ranking, geometric_mean, rank
 from studies.laws.tuning import Budget, Tuned
 from studies.publish import shown
 from studies.study.entries import controlled_links
@@ -25,6 +25,8 @@ from studies.study.spec import Study, parse_study
 
 #: Ratio of residual vibration up to which controllers are as good as each other.
 CLOSE = 1.1
+#: Factor up to which a budget counts as kept on fresh machines.
+TOLERANCE = 1.01
 GIVEN, WITHOUT = "the design as given", "without control"
 
 
@@ -173,14 +175,15 @@ def verdict(findings: LawFindings) -> list[str]:
     if ranking.best < 0:
         return ["No controller keeps the budget and finishes all runs."]
     best, share = findings.name(ranking.best), ranking.share[ranking.best]
+    row = findings.competing[ranking.best]
     often = "all" if share == 1 else f"{100 * share:.0f} % of"
     lines = [
         f"{best} leaves the least residual vibration; it is first in {often} {RESAMPLES} "
         "resamplings of the machines."
     ]
     others = [_other(findings, name) for name in list(FIGURES)[1:]]
-    every = [*_equals(findings), _own_law(findings), *others, _resolution(findings)]
-    return [*lines, *filter(None, every)]
+    every = [*_equals(findings), _own_law(findings), *others, beyond_budget(findings, row)]
+    return [*filter(None, [_resolution(findings)]), *lines, *filter(None, every)]
 
 
 def _equals(findings: LawFindings) -> list[str]:
@@ -206,15 +209,29 @@ def _equals(findings: LawFindings) -> list[str]:
     ]
 
 
+def beyond_budget(findings: LawFindings, k: int) -> str:
+    """Where a controller of the competition exceeds the budget on the machines it was judged on."""
+    judged, budget = findings.judged, findings.budget
+    if k not in findings.competing:
+        return ""
+    volts = np.nanmax(judged.metrics["peak_voltage"][k], initial=0.0)
+    margins = judged.margins["disk_margin"][k]
+    least = np.nanmin(margins, initial=np.inf)
+    parts = []
+    if volts > TOLERANCE * budget.voltage:
+        parts.append(f"up to {volts:.3g} V instead of {budget.voltage:.3g} V")
+    if TOLERANCE * least < budget.margin:
+        parts.append(f"a disk margin down to {least:.3g} instead of {budget.margin:.3g}")
+    return f"On machines it was not tuned on it has {' and '.join(parts)}." if parts else ""
+
+
 def _resolution(findings: LawFindings) -> str:
     """Warning about residual vibration that the controller cannot measure."""
     study, judged = findings.study, findings.judged
     adc_step = frame_of(*check_run(study)).adc_step
     step = least_step("residual_rms", adc_step, controlled_links([study]))
-    medians = np.array(
-        [np.nanmedian(judged.metrics["residual_rms"][k]) for k in findings.competing]
-    )
-    return resolution_text("Median residual_rms", medians, step, "controller")
+    means = [geometric_mean(judged.metrics["residual_rms"][k]) for k in findings.competing]
+    return resolution_text("Mean residual_rms", np.array(means), step, "controller")
 
 
 def _own_law(findings: LawFindings) -> str:

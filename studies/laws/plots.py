@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 from studies.laws.findings import LawFindings
 from studies.laws.judging import FIGURES
+from studies.laws.ranking import geometric_mean
 from studies.show import figures
 from studies.show.units import readable
 
@@ -18,7 +19,7 @@ MOST = 12
 def comparison(findings: LawFindings) -> Figure:
     """Residual vibration of the best controllers on all machines, with the intervals of ratios.
 
-    Left: every machine and move, median marked. Right: the ratio to the best controller with its
+    Left: every machine and move, geometric mean marked. Right: the ratio to the best controller with its
     95 % interval, by each figure.
 
     Args:
@@ -34,7 +35,7 @@ def comparison(findings: LawFindings) -> Figure:
     for y, k in enumerate(order):
         cloud = np.ravel(values[rows[k]])
         left.plot(cloud, np.full(cloud.size, y), "o", markersize=2.5, alpha=0.5, color="#0072B2")
-        left.plot(np.median(cloud), y, "|", markersize=12, markeredgewidth=2, color="#000000")
+        left.plot(geometric_mean(cloud), y, "|", markersize=12, markeredgewidth=2, color="#000000")
     figures.log_scale(left, "x")
     left.set_yticks(range(len(order)), names)
     left.set_xlabel(f"residual rms [{unit}]")
@@ -56,12 +57,14 @@ def comparison(findings: LawFindings) -> Figure:
     figures.log_scale(right, "x")
     right.set_yticks(range(len(order)), [])
     right.set_xlabel("over the best by each figure [1]")
+    for ax in (left, right):
+        ax.set_ylim(-0.6, len(order) - 0.4)
     figures.legend_above(figure, right)
     return figure
 
 
 def grid(findings: LawFindings) -> Figure:
-    """Median residual vibration and platform error of every law (rows) with every drive (columns).
+    """Mean residual vibration and platform error of every law (rows) with every drive (columns).
 
     Args:
         findings: of the comparison.
@@ -71,13 +74,13 @@ def grid(findings: LawFindings) -> Figure:
     drives = list(dict.fromkeys(entry.drive for entry in entries if entry.drive))
     figure, axes = figures.new_figure(1, 2, max(1.6, 0.3 * len(laws) + 0.8), False)
     factor, unit = readable("m")
-    titles = {"residual_rms": "residual rms", "pose_error_peak": "platform error"}
+    titles = {"residual_rms": "mean residual rms", "pose_error_peak": "mean platform error"}
     for ax, (metric, title) in zip(axes[0], titles.items(), strict=True):
         values = np.full((len(laws), len(drives)), np.nan)
         for k, controller in enumerate(findings.controllers):
             if controller.law and not controller.reason:
                 place = laws.index(controller.law), drives.index(controller.drive)
-                values[place] = factor * np.median(findings.judged.metrics[metric][k])
+                values[place] = factor * geometric_mean(findings.judged.metrics[metric][k])
         if np.isfinite(values).any():
             ax.imshow(values, norm=LogNorm(), cmap="Blues", alpha=0.5, aspect="auto")
         for i, row in enumerate(values):

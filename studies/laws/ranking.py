@@ -16,6 +16,13 @@ import numpy as np
 RESAMPLES, CONFIDENCE = 2000, 0.95
 
 
+def geometric_mean(figure: np.ndarray) -> float:
+    """Of the finite values of a positive figure, nan if there are none."""
+    finite = figure[np.isfinite(figure)]
+    smallest = np.finfo(float).tiny
+    return float(np.exp(np.log(np.maximum(finite, smallest)).mean())) if finite.size else np.nan
+
+
 class Ranking(NamedTuple):
     """N controllers by one figure, of which less is better; NaN where a run did not finish."""
 

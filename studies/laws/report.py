@@ -7,31 +7,31 @@ from typing import Any
 
 import numpy as np
 
-from studies.laws.findings import LawFindings, verdict
+from studies.laws.findings import LawFindings, beyond_budget, verdict
 from studies.laws.judging import FIGURES, MOVES, longer
 from studies.laws.machines import spread_of
-from studies.laws.ranking import CONFIDENCE
+from studies.laws.ranking import CONFIDENCE, geometric_mean
 from studies.show.document import json_text
 from studies.show.pages import page
 from studies.show.sketch import CAPTION
 from studies.show.units import number
 from studies.study.consistency import patch_centers
-from studies.study.margin import margin_text
+from studies.study.margin import delay_text, margin_text
 
 #: Columns of the table: metric, its unit, how runs become one number.
 COLUMNS = (
-    ("residual_rms", "m", np.median),
+    ("residual_rms", "m", geometric_mean),
     ("settling_time", "s", np.median),
-    ("pose_error_peak", "m", np.median),
+    ("pose_error_peak", "m", geometric_mean),
     ("peak_voltage", "V", np.max),
     ("control_energy", "V2 s", np.mean),
 )
 HEADS = (
     "controller",
-    "residual rms, median [µm]",
+    "residual rms, geometric mean [µm]",
     "over the best (95 %)",
     "settling, median [ms]",
-    "platform error while moving, median [µm]",
+    "platform error while moving, geometric mean [µm]",
     "largest voltage [V]",
     "rms voltage, mean [V]",
     "control energy, mean [V² s]",
@@ -39,6 +39,7 @@ HEADS = (
 )
 #: Margins of the second table.
 SHOWN_MARGINS = ("disk_margin", "gain_margin", "phase_margin", "delay_margin")
+FIGURE_TEXT = {"gain_margin": lambda x: margin_text(x, 3), "delay_margin": delay_text}
 LOOP_HEADS = (
     "controller",
     "disk margin, worst [1]",
@@ -98,7 +99,8 @@ def _row(findings: LawFindings, k: int) -> list[str]:
     controller, judged = findings.controllers[k], findings.judged
     values = {name: _over(judged.metrics[name][k], over) for name, _, over in COLUMNS}
     lost = int(judged.n_lost[k])
-    note = "; ".join(filter(None, (controller.reason, f"{lost} runs lost" if lost else "")))
+    parts = controller.reason, f"{lost} runs lost" if lost else "", beyond_budget(findings, k)
+    note = "; ".join(filter(None, parts))
     return [
         controller.name,
         number(values["residual_rms"], "m"),
@@ -115,9 +117,7 @@ def _row(findings: LawFindings, k: int) -> list[str]:
 def _loop_row(findings: LawFindings, k: int) -> list[str]:
     controller, products = findings.controllers[k], findings.products[k]
     margins = {} if products is None else _worst_margins(findings, k)
-    texts = [
-        margin_text(x, 3) if name == "gain_margin" else f"{x:.3g}" for name, x in margins.items()
-    ]
+    texts = [FIGURE_TEXT.get(name, "{:.3g}".format)(x) for name, x in margins.items()]
     return [
         controller.name,
         *(texts or ["-"] * len(SHOWN_MARGINS)),

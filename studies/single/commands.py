@@ -199,7 +199,7 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
         console.print(poles)
         console.print(difference(run.poles), soft_wrap=True)
     if run.loop.breaking:
-        console.print(f"beyond that margin goes unstable: {run.loop.breaking}", soft_wrap=True)
+        console.print(f"beyond the gain margin goes unstable: {run.loop.breaking}", soft_wrap=True)
     if warning := caution(run.loop.gain_margin):
         console.print(f"[bold red]{warning}[/]", soft_wrap=True, markup=True)
 

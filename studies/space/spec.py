@@ -141,6 +141,8 @@ def parse_sweep(data: dict[str, Any]) -> SweepSpec:
         if name not in (*MARGINS, *PEAKS):
             hint = nearest(name, (*MARGINS, *PEAKS))
             raise field_error("sweep.robustness", name, ", ".join((*MARGINS, *PEAKS)), hint=hint)
+        if sweep.robustness.count(name) > 1:
+            raise field_error("sweep.robustness", name, "each figure once")
     screen = _parse_screen(sweep) if "screen" in data["sweep"] else None
     return SweepSpec(study=study, sweep=sweep, root=_node(sweep, "sweep"), screen=screen, data=data)
 

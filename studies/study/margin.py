@@ -79,5 +79,10 @@ def robustness_text(figures: Mapping[str, Any]) -> str:
         f"disk margin {disk:.3g} (every actuator at once may be off by {any_gain}, or by a phase "
         f"of +-{turn:.3g} deg); all actuators alike: phase margin "
         f"{'any' if phase >= MOST_PHASE else f'{phase:.3g} deg'}, delay margin "
-        f"{f'> {MOST_DELAY:g}' if delay >= MOST_DELAY else f'{delay:.3g}'} samples"
+        f"{delay_text(delay)} samples"
     )
+
+
+def delay_text(value: float) -> str:
+    """A delay margin in words, without its unit; the search ends at `MOST_DELAY`."""
+    return f"> {MOST_DELAY:g}" if value >= MOST_DELAY else f"{value:.3g}"
