@@ -202,7 +202,8 @@ def metric_values(data: SweepData, name: str) -> np.ndarray:
     A metric or condition number with more axes counts with its largest value over the links that
     any case controls: `residual_rms` is that of the worst link and its worst station,
     `residual_rms[link=3]` that of the worst station of link 3, controlled or not. Of poses, x and y
-    count; `pose_error_peak[2]` is the angle. Indices without a name count from 0. A field that does not vary has the same value in every case.
+    count; `pose_error_peak[2]` is the angle. Indices without a name count from 0. A field that does
+    not vary has the same value in every case.
 
     Raises:
         StudyError: unknown name or entry.

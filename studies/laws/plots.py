@@ -19,7 +19,7 @@ MOST = 12
 def comparison(findings: LawFindings) -> Figure:
     """Residual vibration of the best controllers on all machines, with the intervals of ratios.
 
-    Left: every machine and move, geometric mean marked. Right: the ratio to the best controller with its
+    Left: every machine and move, geometric mean marked. Right: the ratio to the best one with its
     95 % interval, by each figure.
 
     Args:
