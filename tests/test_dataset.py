@@ -11,7 +11,7 @@ import xarray
 import studies
 from jaxmodel import status
 from studies.engine.dataset import as_dataset
-from studies.engine.results import read_sweep
+from studies.engine.results import _worst, read_sweep
 from studies.errors import StudyError
 from studies.sweeps.show import best_cases
 from tests.mutations import sweep_folder
@@ -175,3 +175,9 @@ def test_results_in_another_format_are_refused_in_one_sentence(folders, tmp_path
     text = str(caught.value)
     assert text.startswith(f"{tmp_path}: its results have format {version or 1}, this version ")
     assert "run the sweep again" in text and manifest["git"] in text
+
+
+def test_of_a_pose_x_and_y_count():
+    """Its angle has another unit."""
+    error = np.array([[1e-6, 2e-6, 5e-3], [3e-6, 1e-6, 0.0]])
+    assert _worst(None, error, ("case", "pose_axis")).tolist() == [2e-6, 3e-6]

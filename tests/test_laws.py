@@ -15,6 +15,7 @@ from studies.engine.runs import run_study
 from studies.errors import StudyError
 from studies.laws import run as laws
 from studies.laws.candidates import AS_GIVEN, Contender, drive_candidates, law_candidates
+from studies.laws.findings import beyond_budget
 from studies.laws.judging import MOVES, breaking_text, changes, judging_sweep, longer
 from studies.laws.machines import machines_of, spread_of, with_noise
 from studies.laws.ranking import rank
@@ -196,6 +197,8 @@ def test_budget_from_the_command_line():
     for bad in ({"voltage": -1.0}, {"voltage": 1e3}, {"margin": 2.5}, {"margin": float("nan")}):
         with pytest.raises(StudyError, match=f"--{next(iter(bad))}"):
             make_budget(STUDY, **({"voltage": 20.0, "margin": 0.4} | bad))
+    with pytest.raises(StudyError, match="--voltage: the design's loop is unstable"):
+        make_budget(STUDY.change(control__gain_factor=20.0), None, 0.4)
 
 
 def tuned(candidate, study):
@@ -228,6 +231,11 @@ def test_a_comparison_writes_a_page_whose_order_is_that_of_the_runs(tmp_path, mo
     for name, value in alone.items():
         assert strong["margins"][name] == pytest.approx(value, rel=0.2)
     assert 0 < strong["rms_voltage"] < strong["peak_voltage"]
+    assert strong["residual_rms"] == pytest.approx(np.exp(np.log(own[3]).mean()))
+    assert beyond_budget(findings, 3) == ""
+    tight = findings._replace(budget=findings.budget._replace(voltage=1e-3, margin=1.99))
+    text = beyond_budget(tight, 3)
+    assert "V instead of 0.001 V" in text and "a disk margin down to" in text
     html = findings._repr_html_()
     assert "strong + PD" in html and html.count("data:image/png;base64,") == 1
     with pytest.raises(StudyError, match="another design, budget or program"):

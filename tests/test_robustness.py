@@ -615,3 +615,6 @@ def test_figures_that_no_sweep_has_are_named():
     }
     with pytest.raises(StudyError, match="sweep.robustness = 'disc_margin'.*disk_margin"):
         parse_sweep(data)
+    data["sweep"]["robustness"] = ["disk_margin", "disk_margin"]
+    with pytest.raises(StudyError, match="sweep.robustness = 'disk_margin'.*once"):
+        parse_sweep(data)

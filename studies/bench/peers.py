@@ -292,6 +292,8 @@ def by_lagrangian(work: Work, n: int) -> Callable[[], Any]:
         basis = build_basis(
             structure.basis, machine.beam, machine.patches, structure.n_modes, station_places(case)
         )
+        if not structure.is_distributed:
+            basis = basis._replace(inward=None, centrifugal=None)
         loop = start.loop
         mass, drive = loop.plant.modal_mass[:, None], loop.drive
 

@@ -108,7 +108,18 @@ def _figures_of(
 
 
 def _peaks_of(response: SampledLoopResponse, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    return jax.tree.map(np.asarray, _figures(names, response)) if names else {}
+    """H-infinity norms, NaN where a number of the response is not finite."""
+    if not names:
+        return {}
+    is_finite = _are_finite(jax.tree.map(np.asarray, response))
+    peaks = _figures(names, response)
+    return {name: np.where(is_finite, np.asarray(peak), np.nan) for name, peak in peaks.items()}
+
+
+def _are_finite(tree: Any) -> np.ndarray:
+    """Which loops have finite numbers only, of leaves (n, ...), (n,)."""
+    leaves = [x.reshape(len(x), -1) for x in jax.tree.leaves(tree)]
+    return np.all([np.isfinite(x).all(axis=1) for x in leaves], axis=0)
 
 
 def find_margins(
@@ -127,8 +138,7 @@ def find_margins(
     """
     # loops near the edge need more than single precision
     response, modes = jax.tree.map(lambda x: np.asarray(x, float), (response, modes))
-    leaves = [x.reshape(len(x), -1) for x in jax.tree.leaves((response, modes))]
-    is_finite = np.all([np.isfinite(x).all(axis=1) for x in leaves], axis=0)
+    is_finite = _are_finite((response, modes))
     acting, count = acting_commands(response.controller), len(is_finite)
     found = {
         name: MarginPlace(np.full(count, np.nan), np.ones(count), np.ones(count)) for name in names

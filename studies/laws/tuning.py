@@ -60,6 +60,8 @@ def make_budget(study: Study, voltage: float | None, margin: float) -> Budget:
         run = run_study(study)
         if run.status not in status.FINISHED:
             raise StudyError(f"--voltage: the design ends with {describe(run.status)}; name one")
+        if run.loop is not None and run.loop.gain_margin < 1:
+            raise StudyError("--voltage: the design's loop is unstable; name one")
         voltage = float(np.max(run.result.metrics.peak_voltage))
         if voltage == 0:
             raise StudyError("--voltage: the design uses none; name one")
