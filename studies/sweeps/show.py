@@ -354,7 +354,8 @@ def counted_text(data: SweepData, by: str) -> str:
     parts = []
     if "link" in axes and "link=" not in by:
         parts.append(links_text(tuple(np.flatnonzero(counted_links(data)).tolist())))
-    parts += [f"all {axis}s" for axis in axes if axis != "link" and f"{axis}=" not in by]
+    rest = [axis for axis in axes if axis != "link" and f"{axis}=" not in by]
+    parts += ["x and y" if axis == "pose_axis" else f"all {axis}s" for axis in rest]
     return f"largest of {' and '.join(parts)}" if parts else "one number"
 
 
@@ -419,6 +420,8 @@ def short_value(value: Any) -> str:
 def unit_of_metric(data: SweepData, name: str) -> str:
     """Unit of a metric or axis, "" if it has none."""
     variable = data.variables.get(name) or data.variables.get(name.split("[")[0])
+    if variable is not None and "pose_axis" in variable.dims:
+        return "rad" if name.endswith(("[2]", "[pose_axis=3]")) else "m"
     return "" if variable is None or variable.units == "1" else variable.units
 
 
