@@ -193,10 +193,9 @@ def delayed_parts(structure: Structure, case: Case, pose: Array, law: Controller
     """Parts of a loop to which a further delay can be given; arguments as `delayed_loop`."""
     late = structure._replace(has_delay=True)
     smooth, drive = late._replace(is_smooth=True, feedback="sampled"), DRIVES[structure.drive]
-    matrices = closed_loop(late, case, pose, law)
-    plant = linearise(
-        smooth, prepare(smooth, case).loop, pose, resting(late, case), drive.is_sampled
-    )
+    loop, moment = prepare(smooth, case).loop, resting(late, case)
+    matrices = loop_matrices(late, case, loop, law, pose, moment)
+    plant = linearise(smooth, loop, pose, moment, drive.is_sampled)
     analogue = analogue_plant(smooth, plant, case)
     from jax.flatten_util import ravel_pytree
 

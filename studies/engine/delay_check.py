@@ -36,8 +36,8 @@ def checked_delays(structure: Structure, cases: Case, delay: np.ndarray) -> np.n
 
     Returns:
         Delay margins, within 2 % or, where replaced, 1e-3 of them [samples], (n,). Delays beyond
-        `jaxmodel.delay.LONGEST` in all are not looked at: a margin seen nowhere before is `delay`,
-        or that delay if it is larger.
+        `jaxmodel.delay.LONGEST` in all are not looked at: a loop that is stable up to there has
+        the margin that was searched, or the delay that leads there if that is larger.
     """
     own = np.asarray(true_delay(cases.electronics))
     loops = DelayedLoops.of(_parts(structure, cases), np.asarray(cases.electronics.period), own)
@@ -52,7 +52,9 @@ def _checked(loops: DelayedLoops, k: int, delay: float, room: float) -> float:
     if is_stable and (delay >= room or loops.growth(k, min(delay * BEYOND, room)) > 0):
         return delay
     edge = _first_edge(loops, k, room if is_stable else end)
-    return edge if edge is not None else max(delay, room) if is_stable else delay
+    if edge is not None:
+        return edge
+    return max(delay, room) if is_stable else delay
 
 
 def _first_edge(loops: DelayedLoops, k: int, last: float) -> float | None:
@@ -94,6 +96,7 @@ class DelayedLoops(NamedTuple):
     """Loops whose commands can come later, NumPy; n of them."""
 
     parts: DelayedParts
+    without: np.ndarray  # transitions without what commands do to plant and electronics, (n, m, m)
     period: np.ndarray  # [s], (n,)
     own: np.ndarray  # delay of each [samples], (n,)
     pole: np.ndarray  # of plant and electronics [rad/s], (n, a)
@@ -108,17 +111,19 @@ class DelayedLoops(NamedTuple):
         state = np.where(is_finite[:, None, None], parts.state, np.eye(parts.state.shape[1]))
         pole, shape = np.linalg.eig(state + 0j)
         enters = np.linalg.solve(shape, np.where(np.isfinite(parts.enters), parts.enters, 0.0))
-        return cls(parts, period, own, pole, shape, enters, is_finite)
+        loops = cls(parts, parts.matrix.copy(), period, own, pole, shape, enters, is_finite)
+        for k in map(int, np.flatnonzero(is_finite)):
+            loops.without[k, : pole.shape[1]] -= loops.commanded(k, own[k])
+        return loops
 
     def growth(self, k: int, delay: float) -> float:
         """Logarithm of the spectral radius of loop k with a further delay [samples]."""
-        matrix = self.parts.matrix[k].copy()
-        n = len(self.pole[k])
-        matrix[:n] += self._commands(k, self.own[k] + delay) - self._commands(k, self.own[k])
+        matrix = self.without[k].copy()
+        matrix[: len(self.pole[k])] += self.commanded(k, self.own[k] + delay)
         return float(np.log(np.abs(np.linalg.eigvals(matrix)).max()))
 
-    def _commands(self, k: int, delay: float) -> np.ndarray:
-        """Next state of plant and electronics by commands, now or earlier, (a, m)."""
+    def commanded(self, k: int, delay: float) -> np.ndarray:
+        """What commands, now or earlier, do to plant and electronics over a sample, (a, m)."""
         matrix, commands = self.parts.matrix[k], self.parts.commands[k]
         n, n_sensors = self.enters[k].shape
         whole = max(int(np.ceil(delay)), 1)

@@ -94,12 +94,12 @@ def _figures_of(
     parts = np.split(rows, len(rows) // BATCH)
 
     def judge(part: np.ndarray) -> dict[str, np.ndarray]:
-        response, modes = _responses(structure, jax.tree.map(lambda x: x[part], whole))
+        some = jax.tree.map(lambda x: x[part], whole)
+        response, modes = _responses(structure, some)
         places = find_margins(response, modes, tuple(x for x in names if x in MARGINS))
         margins = {name: place.value for name, place in places.items()}
         if "delay_margin" in margins and not LAWS[structure.law].is_switching:
-            alone = jax.tree.map(lambda x: x[part], whole)
-            margins["delay_margin"] = checked_delays(structure, alone, margins["delay_margin"])
+            margins["delay_margin"] = checked_delays(structure, some, margins["delay_margin"])
         return margins | _peaks_of(response, tuple(x for x in names if x in PEAKS))
 
     with threadpool_limits(1, "blas"), ThreadPoolExecutor(len(hosts())) as pool:

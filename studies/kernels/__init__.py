@@ -5,4 +5,6 @@
   `routines` keeps functions that are called more than once.
 - `cpu`: that loop for this processor, written by `llvm` and `vectors`; needs llvmlite.
 - `gpu`: the same loop for GPUs, as PTX.
+- `differentiable`: either of them as a JAX function with derivatives, by `adjoint` for the reverse;
+  `bridge` makes XLA call this processor's.
 """
