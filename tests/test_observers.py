@@ -54,6 +54,30 @@ def test_riccati_equations_are_solved(seed):
     )
 
 
+@pytest.mark.parametrize("name", range(4))
+def test_riccati_solutions_have_derivatives(name):
+    """In both modes, against differences of SciPy's solutions, to 1e-6."""
+    rng = np.random.default_rng(name)
+    n, m = 7, 2
+    a = rng.normal(size=(n, n))
+    numbers = [0.999 * a / np.abs(np.linalg.eigvals(a)).max(), rng.normal(size=(n, m))]
+    numbers += [np.diag(rng.uniform(0, 1, n)), np.diag(rng.uniform(0.5, 1, m))]
+    change = rng.normal(size=numbers[name].shape)
+    change = change + change.T if name > 1 else change  # Q and R stay symmetric
+    weight = rng.normal(size=(n, n))
+
+    def solved(solve, x):
+        return solve(*numbers[:name], numbers[name] + x * change, *numbers[name + 1 :])
+
+    step = 1e-5
+    ahead, behind = (solved(solve_discrete_are, x) for x in (step, -step))
+    wanted = (ahead - behind) / (2 * step)
+    forward = jax.jvp(lambda x: solved(solve_riccati, x), (0.0,), (1.0,))[1]
+    np.testing.assert_allclose(forward, wanted, atol=1e-6 * np.abs(wanted).max())
+    reverse = jax.grad(lambda x: jnp.sum(weight * solved(solve_riccati, x)))(0.0)
+    np.testing.assert_allclose(reverse, np.sum(weight * forward), rtol=1e-9)
+
+
 def compensator(study, nominal, case, link):
     """A, B, C, D of one link by SciPy: each mode with its own filter, then hold and delay.
 
