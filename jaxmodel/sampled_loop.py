@@ -8,6 +8,7 @@ sampled drive is the loop's own `drive_step` at rest.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -85,24 +86,12 @@ def loop_matrices(
     plant = linearise(smooth, loop, pose, moment, drive.is_sampled)
     analogue = analogue_plant(smooth, plant, case)
     exact = _over_a_sample(smooth, analogue, case)
-    from jax.flatten_util import ravel_pytree
-
-    n = len(exact.held)
+    step = _Step(smooth, case, loop, law, plant, analogue.filtered, exact)
     no_reference = jnp.zeros((6,), analogue.state.dtype)
-    rest, unpack = ravel_pytree((rest_controller(law), resting_drive(drive, no_reference[:3])))
-
-    def advance(x: Array, factor: Array, reference: Array) -> Array:
-        before, servo = unpack(x[n:])
-        filtered = jnp.reshape(x[analogue.filtered], before.voltage.shape)
-        after, _ = controller_step(with_gains(law, factor), before, filtered, None, True)
-        moved = _moved(exact, jnp.concatenate([x[:n], jnp.ravel(before.voltage)]), servo)
-        if exact.newest is not None:
-            moved = moved + exact.newest @ jnp.ravel(after.voltage)
-        servo = _next_drive(smooth, case, loop, plant, x, servo, reference)
-        return jnp.concatenate([moved, ravel_pytree((after, servo))[0]])
-
+    rest, unpack = step.rest()
+    n = len(exact.held)
     start = jnp.concatenate([jnp.zeros((n,), analogue.state.dtype), rest])
-    jacobian = jax.jacfwd(advance)
+    jacobian = jax.jacfwd(step.advance)
     without = jacobian(start, 0.0, no_reference)
 
     def deflected(x: Array) -> Array:
@@ -120,8 +109,46 @@ def loop_matrices(
         plant=linearise(smooth, loop, pose, moment).state if drive.is_sampled else plant.state,
         force=jnp.pad(exact.force, ((0, start.size - n), (0, 0))),
         deflection=jax.jacfwd(deflected)(start),
-        reference=jax.jacfwd(advance, 2)(start, 0.0, no_reference) if drive.is_sampled else None,
+        reference=jax.jacfwd(step.advance, 2)(start, 0.0, no_reference)
+        if drive.is_sampled
+        else None,
     )
+
+
+class _Step(NamedTuple):
+    """What a closed loop does over one sample."""
+
+    structure: Structure
+    case: Case
+    loop: Loop
+    law: Controller
+    plant: LinearPlant
+    filtered: slice  # of the state: what the converters see
+    exact: _Sampled
+
+    def rest(self) -> tuple[Array, Callable[[Array], Any]]:
+        """State of controller and drive at rest, and the function that unpacks such a state."""
+        from jax.flatten_util import ravel_pytree
+
+        still = jnp.zeros((3,), self.exact.held.dtype)
+        return ravel_pytree(
+            (rest_controller(self.law), resting_drive(DRIVES[self.structure.drive], still))
+        )
+
+    def advance(self, x: Array, factor: Array | float, reference: Array) -> Array:
+        """Next state, with all gains times a factor and the reference of a sampled drive, (6,)."""
+        from jax.flatten_util import ravel_pytree
+
+        n = len(self.exact.held)
+        before, servo = self.rest()[1](x[n:])
+        filtered = jnp.reshape(x[self.filtered], before.voltage.shape)
+        law = with_gains(self.law, factor)
+        after, _ = controller_step(law, before, filtered, None, True)
+        moved = _moved(self.exact, jnp.concatenate([x[:n], jnp.ravel(before.voltage)]), servo)
+        if self.exact.newest is not None:
+            moved = moved + self.exact.newest @ jnp.ravel(after.voltage)
+        servo = _next_drive(self.structure, self.case, self.loop, self.plant, x, servo, reference)
+        return jnp.concatenate([moved, ravel_pytree((after, servo))[0]])
 
 
 def _moved(exact: _Sampled, inputs: Array, servo: DriveState | None) -> Array:
@@ -183,31 +210,34 @@ class DelayedParts(NamedTuple):
     u_(k-LONGEST).
     """
 
-    matrix: Array  # transition at the delay of the case, (m, m)
+    matrix: Array  # transition, 0 for plant and electronics, (m, m)
     state: Array  # A of plant and electronics, (n, n)
-    enters: Array  # B of commands, (n, 3 K)
+    enters: Array  # B of commands and slider forces, (n, 3 K + 3)
     commands: Array  # place of every command u_(k-1) in the state, (3 K,), integers
+    forces: Array | None  # place of the forces that a sampled drive holds, (3,), integers
 
 
 def delayed_parts(structure: Structure, case: Case, pose: Array, law: Controller) -> DelayedParts:
-    """Parts of a loop to which a further delay can be given; arguments as `delayed_loop`."""
-    late = structure._replace(has_delay=True)
-    smooth, drive = late._replace(is_smooth=True, feedback="sampled"), DRIVES[structure.drive]
-    loop, moment = prepare(smooth, case).loop, resting(late, case)
-    matrices = loop_matrices(late, case, loop, law, pose, moment)
-    plant = linearise(smooth, loop, pose, moment, drive.is_sampled)
+    """Parts of a loop that can be given any delay; arguments as `delayed_loop`."""
+    smooth = structure._replace(has_delay=True, is_smooth=True, feedback="sampled")
+    loop, drive = prepare(smooth, case).loop, DRIVES[structure.drive]
+    plant = linearise(smooth, loop, pose, resting(smooth, case), drive.is_sampled)
     analogue = analogue_plant(smooth, plant, case)
-    from jax.flatten_util import ravel_pytree
-
-    n, n_sensors = len(analogue.state), 3 * structure.n_patches
-    rest, unpack = ravel_pytree(rest_controller(law))
-    first = n + (LONGEST - 1) * n_sensors
-    places = unpack(jnp.arange(rest.size, dtype=rest.dtype)).voltage
+    count, n_sensors, dtype = len(analogue.state), 3 * structure.n_patches, analogue.state.dtype
+    below = jnp.pad(_queue(n_sensors, dtype), ((count, 0), (count, 0)))
+    unmoved = jnp.zeros((len(below), 3), dtype)
+    exact = _Sampled(held=below, newest=None, force=unmoved, present=unmoved)
+    step = _Step(smooth, case, loop, law, plant, analogue.filtered, exact)
+    rest, unpack = step.rest()
+    n = len(below)
+    places, servo = unpack(jnp.arange(n, n + rest.size, dtype=dtype))
+    start = jnp.concatenate([jnp.zeros((n,), dtype), rest])
     return DelayedParts(
-        matrix=matrices.open + matrices.feedback,
+        matrix=jax.jacfwd(step.advance)(start, 1.0, jnp.zeros((6,), dtype)),
         state=analogue.state,
-        enters=analogue.enters[:, :n_sensors],
-        commands=first + jnp.ravel(places).astype(int),
+        enters=analogue.enters,
+        commands=jnp.ravel(places.voltage).astype(int),
+        forces=None if servo is None else servo.force.astype(int),
     )
 
 
@@ -303,9 +333,7 @@ def _over_a_sample(structure: Structure, analogue: AnaloguePlant, case: Case) ->
         a * whole[:, n : n + n_sensors] + b * second[:, n : n + n_sensors]
         for a, b in zip(change.before, change.after, strict=True)
     )
-    # one queue: u_(k-1) enters as u_(k-2), each older one moves on
-    queue = jnp.eye((LONGEST - 1) * n_sensors, LONGEST * n_sensors, -n_sensors, eye.dtype)
-    queue = queue.at[:n_sensors, -n_sensors:].set(eye)
+    queue = _queue(n_sensors, eye.dtype)
     below = jnp.pad(queue, ((0, 0), (n, 0)))
     above = jnp.concatenate([whole[:, :n], *older, last], axis=1)
     present = jnp.concatenate([share * eye for share in (*change.before[2:], change.before[1])], 1)
@@ -316,6 +344,12 @@ def _over_a_sample(structure: Structure, analogue: AnaloguePlant, case: Case) ->
         force=jnp.pad(force, ahead),
         present=jnp.pad(present, ((0, 0), (n, 0))),
     )
+
+
+def _queue(n_sensors: int, dtype: Any) -> Array:
+    """Commands on their way one sample later, by them and u_(k-1): that enters as u_(k-2)."""
+    queue = jnp.eye((LONGEST - 1) * n_sensors, LONGEST * n_sensors, -n_sensors, dtype)
+    return queue.at[:n_sensors, -n_sensors:].set(jnp.eye(n_sensors, dtype=dtype))
 
 
 def _held_transition(analogue: AnaloguePlant, period: Array) -> Array:

@@ -21,6 +21,7 @@ from jaxmodel.robustness import margin_at, norm_peaks, search_frequencies
 from jaxmodel.sampled_loop import analogue_plant, closed_loop, delayed_loop
 from jaxmodel.scaling import best_scaling
 from studies.engine import diagonal_scaling
+from studies.engine.delay_check import delayed_loops
 from studies.engine.loop_gain import loop_gains
 from studies.engine.margins import judge_loops
 from studies.engine.results import read_sweep
@@ -291,6 +292,21 @@ def test_no_delay_margin_is_missed(name):
     margin = found["delay_margin"][0]
     radii = [radius(np.asarray(late(margin * x))) for x in np.linspace(0.04, 0.99, 20)]
     assert max(radii) < 1 < radius(np.asarray(late(1.01 * margin)))
+
+
+@pytest.mark.parametrize("kind", ["pd", "super_twisting"])
+def test_poles_of_a_later_loop_are_those_of_its_delay(kind):
+    """A plant on a sampled drive moves freely, which has no eigenvectors of its own."""
+    study = STUDY.change(link__modes=3, drive__kind=kind)
+    structure = build_structure(study)
+    cases = jax.tree.map(lambda x: x[None], as_arrays(build_case(study)))
+    case = jax.tree.map(lambda x: x[0], cases)
+    law = prepare(structure, case).loop.controller
+    loops = delayed_loops(structure, cases)
+    late = jax.jit(lambda x: delayed_loop(structure, case, case.path.waypoints[0], law, x))
+    for delay in (0.0, 0.3, 1.0, 2.625):
+        wanted = np.log(radius(np.asarray(late(delay))))
+        assert loops.growth(0, delay) == pytest.approx(wanted, abs=1e-10)
 
 
 def smallest_norm(matrix: np.ndarray) -> float:

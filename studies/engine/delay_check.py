@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from scipy.linalg import expm, matrix_balance
 from scipy.optimize import minimize_scalar
 
 from jaxmodel.case import Case, Structure
@@ -39,9 +40,14 @@ def checked_delays(structure: Structure, cases: Case, delay: np.ndarray) -> np.n
         `jaxmodel.delay.LONGEST` in all are not looked at: a loop that is stable up to there has
         the margin that was searched, or the delay that leads there if that is larger.
     """
-    own = np.asarray(true_delay(cases.electronics))
-    loops = DelayedLoops.of(_parts(structure, cases), np.asarray(cases.electronics.period), own)
-    return np.array([_checked(loops, k, x, LONGEST - own[k]) for k, x in enumerate(delay)])
+    loops = delayed_loops(structure, cases)
+    return np.array([_checked(loops, k, x, LONGEST - loops.own[k]) for k, x in enumerate(delay)])
+
+
+def delayed_loops(structure: Structure, cases: Case) -> DelayedLoops:
+    """Loops of cases; arguments as `checked_delays`."""
+    period, own = np.asarray(cases.electronics.period), true_delay(cases.electronics)
+    return DelayedLoops.of(_parts(structure, cases), period, np.asarray(own))
 
 
 def _checked(loops: DelayedLoops, k: int, delay: float, room: float) -> float:
@@ -95,42 +101,42 @@ def _edge(loops: DelayedLoops, k: int, lower: float, upper: float) -> float:
 class DelayedLoops(NamedTuple):
     """Loops whose commands can come later, NumPy; n of them."""
 
-    parts: DelayedParts
-    without: np.ndarray  # transitions without what commands do to plant and electronics, (n, m, m)
+    parts: DelayedParts  # with the transition of plant and electronics, without commands
     period: np.ndarray  # [s], (n,)
     own: np.ndarray  # delay of each [samples], (n,)
-    pole: np.ndarray  # of plant and electronics [rad/s], (n, a)
-    shape: np.ndarray  # their eigenvectors, (n, a, a)
-    enters: np.ndarray  # commands in coordinates of these, (n, a, 3 K)
+    held: np.ndarray  # response of plant and electronics to commands over a sample, (n, a, 3 K)
     is_finite: np.ndarray  # (n,)
 
     @classmethod
     def of(cls, parts: DelayedParts, period: np.ndarray, own: np.ndarray) -> DelayedLoops:
-        parts = jax.tree.map(np.asarray, parts)
-        is_finite = np.array([np.isfinite(x).all() for x in parts.matrix])
-        state = np.where(is_finite[:, None, None], parts.state, np.eye(parts.state.shape[1]))
-        pole, shape = np.linalg.eig(state + 0j)
-        enters = np.linalg.solve(shape, np.where(np.isfinite(parts.enters), parts.enters, 0.0))
-        loops = cls(parts, parts.matrix.copy(), period, own, pole, shape, enters, is_finite)
+        parts = jax.tree.map(np.array, parts)
+        both = zip(parts.matrix, parts.state, parts.enters, strict=True)
+        is_finite = np.array([all(np.isfinite(x).all() for x in each) for each in both])
+        n, n_commands = parts.state.shape[1], parts.commands.shape[1]
+        held = np.zeros((len(period), n, n_commands))
         for k in map(int, np.flatnonzero(is_finite)):
-            loops.without[k, : pole.shape[1]] -= loops.commanded(k, own[k])
-        return loops
+            free, driven = held_response(parts.state[k], parts.enters[k], period[k])
+            parts.matrix[k, :n, :n] += free
+            held[k] = driven[:, :n_commands]
+            if parts.forces is not None:
+                parts.matrix[k][:n, parts.forces[k]] += driven[:, n_commands:]
+        return cls(parts, period, own, held, is_finite)
 
     def growth(self, k: int, delay: float) -> float:
         """Logarithm of the spectral radius of loop k with a further delay [samples]."""
-        matrix = self.without[k].copy()
-        matrix[: len(self.pole[k])] += self.commanded(k, self.own[k] + delay)
+        matrix = self.parts.matrix[k].copy()
+        matrix[: len(self.held[k])] += self._commanded(k, self.own[k] + delay)
         return float(np.log(np.abs(np.linalg.eigvals(matrix)).max()))
 
-    def commanded(self, k: int, delay: float) -> np.ndarray:
+    def _commanded(self, k: int, delay: float) -> np.ndarray:
         """What commands, now or earlier, do to plant and electronics over a sample, (a, m)."""
         matrix, commands = self.parts.matrix[k], self.parts.commands[k]
-        n, n_sensors = self.enters[k].shape
+        n, n_sensors = self.held[k].shape
         whole = max(int(np.ceil(delay)), 1)
-        share = delay - (whole - 1)
-        rest = (1 - share) * self.period[k]
-        after = self._held(k, rest)
-        before = self._held(k, share * self.period[k], np.exp(self.pole[k] * rest))
+        rest = (whole - delay) * self.period[k]  # of the sample, after the newer command
+        enters = self.parts.enters[k][:, :n_sensors]
+        after = held_response(self.parts.state[k], enters, rest)[1]
+        before = self.held[k] - after
         places = [None, commands]  # of u_(k), u_(k-1) and those on their way
         places += [n + j * n_sensors + np.arange(n_sensors) for j in range(LONGEST - 1)]
         found = np.zeros((n, len(matrix)))
@@ -141,13 +147,25 @@ class DelayedLoops(NamedTuple):
                 found += gain @ matrix[commands]
         return found
 
-    def _held(self, k: int, time: float, then: np.ndarray | float = 1.0) -> np.ndarray:
-        """Change of plant and electronics by commands held over a time [s], (a, 3 K)."""
-        pole = self.pole[k]
-        moved = np.where(
-            np.abs(pole) > 0, np.expm1(pole * time) / np.where(pole == 0, 1, pole), time
-        )
-        return np.real(self.shape[k] * (moved * then) @ self.enters[k])
+
+def held_response(
+    state: np.ndarray, enters: np.ndarray, time: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Transition of a plant over a time [s], and its response to held inputs.
+
+    A plant on a sampled drive has no eigenvectors for its free motion, so its exponential is not
+    taken by modes.
+
+    Returns:
+        (n, n) and (n, inputs).
+    """
+    n, n_inputs = enters.shape
+    whole = np.zeros((n + n_inputs,) * 2)
+    whole[:n, :n], whole[:n, n:] = state, enters
+    # velocities against positions: unbalanced, the exponential loses digits
+    balanced, (scale, _) = matrix_balance(whole, permute=False, separate=True)
+    exact = expm(balanced * time) * scale[:, None] / scale
+    return exact[:n, :n], exact[:n, n:]
 
 
 # compiled without optimisation: it takes a fraction of the time
