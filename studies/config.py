@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 from studies.cache import chosen_folder, exposure, is_usable
@@ -155,19 +156,31 @@ def is_keeping() -> bool:
     return _keeps_programs
 
 
+_without_cache = Lock(), [0]  # how many threads compile without JAX's cache
+
+
 @contextmanager
 def without_jax_cache() -> Iterator[None]:
     """Compile anew: an executable from JAX's own cache lacks what it needs to be kept elsewhere."""
-    from jax.experimental.compilation_cache.compilation_cache import reset_cache
-
-    is_enabled = _settings().jax_enable_compilation_cache
-    _settings().update("jax_enable_compilation_cache", False)
-    reset_cache()  # what JAX has decided when it compiled first
+    lock, count = _without_cache
+    with lock:
+        if not count[0]:
+            _turn_cache(False)
+        count[0] += 1
     try:
         yield
     finally:
-        _settings().update("jax_enable_compilation_cache", is_enabled)
-        reset_cache()
+        with lock:
+            count[0] -= 1
+            if not count[0]:
+                _turn_cache(_has_cache)
+
+
+def _turn_cache(is_on: bool) -> None:
+    from jax.experimental.compilation_cache.compilation_cache import reset_cache
+
+    _settings().update("jax_enable_compilation_cache", is_on)
+    reset_cache()  # what JAX has decided when it compiled first
 
 
 def start(precision: str = "float64", gpu: bool = False) -> None:
@@ -229,8 +242,7 @@ def origin() -> dict[str, str]:
 
 def cache_folder() -> str:
     """Where compiled programs are kept; "" for nowhere."""
-    is_kept = _settings().jax_enable_compilation_cache
-    return (is_kept and _settings().jax_compilation_cache_dir) or ""
+    return (_has_cache and _settings().jax_compilation_cache_dir) or ""
 
 
 _is_configured = False
@@ -329,22 +341,22 @@ def _require_in_force(present: str, devices: int | None, flags: bool) -> None:
         )
 
 
+_has_cache = False
+
+
 def _set_cache(cache: bool) -> None:
     """Turn the persistent cache of compiled programs on or off."""
-    _settings().update("jax_enable_compilation_cache", cache)
-    if not cache:
-        return
-    folder = chosen_folder()
-    is_there = is_usable(folder)
-    if fault := is_there and exposure(folder):
+    global _has_cache
+    _has_cache = cache and is_usable(folder := chosen_folder())
+    if _has_cache and (fault := exposure(folder)):
         warnings.warn(fault, CacheWarning, stacklevel=3)
-    if not is_there or fault:
-        # The cache only saves time: an unwritable home folder must not stop a study.
-        _settings().update("jax_enable_compilation_cache", False)
-        return
-    _settings().update("jax_compilation_cache_dir", str(folder))
-    # Reading an entry takes tens of milliseconds: not worth it for quick compilations.
-    _settings().update("jax_persistent_cache_min_compile_time_secs", 0.5)
+        _has_cache = False
+    # The cache only saves time: an unwritable home folder must not stop a study.
+    _settings().update("jax_enable_compilation_cache", _has_cache)
+    if _has_cache:
+        _settings().update("jax_compilation_cache_dir", str(folder))
+        # Reading an entry takes tens of milliseconds: not worth it for quick compilations.
+        _settings().update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 def usable_cores() -> int:

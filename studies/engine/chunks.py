@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import threading
+import time
+from collections import deque
 from collections.abc import Callable, Generator
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple, Protocol
 
 import jax
@@ -72,8 +75,12 @@ class Runner(Protocol):
         ...
 
 
+#: Groups that are begun side by side: a compiler keeps about one core busy.
+BEGUN = 2
+
+
 class LocalRunner:
-    """Runs chunks in this process, on its own devices."""
+    """Runs chunks in this process, on its own devices; compiles for the next group meanwhile."""
 
     def layout(self, n: int, structure: Structure) -> Layout:
         return local_layout(n, structure)
@@ -81,32 +88,77 @@ class LocalRunner:
     def run(
         self, table: CaseTable, groups: list[Group], reporter: Reporter, stop: threading.Event
     ) -> Generator[Done | Lost]:
-        for group in groups:
-            has_own = has_own_ratio(table, group)
-            executor = Executor(group.structure, group.layout, has_own)
-            pending: tuple[Chunk, Started] | None = None
-            for chunk in group.chunks():
-                is_first = executor.compile_time == 0
-                if is_first:
-                    reporter.compiling()
-                cases = chunk_cases(table, chunk.rows, group.structure, group.layout.size)
-                judged = group.is_judged, group.robustness
-                started = start_chunk(executor, table, chunk.rows, cases, has_own, *judged)
-                if is_first:
-                    reporter.compiled(executor.name, executor.compile_time)
-                # the device computes this chunk while the previous one is written
-                if pending is not None:
-                    yield _wait_for(group, *pending)
-                pending = chunk, started
-                if stop.is_set():
-                    break
-            if pending is not None:
-                if stop.is_set() and reporter.n_run:  # the previous is safe, this one just begun
-                    pending[1].cancel()
-                    return
-                yield _wait_for(group, *pending)
+        waiting, begun = iter(groups), deque[Future[_BegunGroup]]()
+        with ThreadPoolExecutor(BEGUN) as pool:
+
+            def begin_next() -> None:
+                group = next(waiting, None)
+                if group is not None and not stop.is_set():
+                    begun.append(pool.submit(_begin, table, group))
+
+            try:
+                for _ in range(BEGUN):
+                    begin_next()
+                while begun:
+                    one = _waited_for(begun[0], reporter)
+                    begun.popleft()
+                    yield from _finish(table, one, reporter, stop)
+                    if stop.is_set():
+                        return
+                    begin_next()
+            finally:
+                for future in begun:
+                    if not future.cancel() and future.exception() is None:
+                        future.result().first.cancel()
+
+
+class _BegunGroup(NamedTuple):
+    """A group whose program is compiled, and whose first chunk runs."""
+
+    group: Group
+    executor: Executor
+    first: Started
+
+
+def _begin(table: CaseTable, group: Group) -> _BegunGroup:
+    executor = Executor(group.structure, group.layout, has_own_ratio(table, group))
+    return _BegunGroup(group, executor, _start(table, group, executor, group.chunks()[0]))
+
+
+def _start(table: CaseTable, group: Group, executor: Executor, chunk: Chunk) -> Started:
+    cases = chunk_cases(table, chunk.rows, group.structure, group.layout.size)
+    own = has_own_ratio(table, group)
+    return start_chunk(executor, table, chunk.rows, cases, own, group.is_judged, group.robustness)
+
+
+def _waited_for(begun: Future[_BegunGroup], reporter: Reporter) -> _BegunGroup:
+    """A group, as soon as its first chunk runs; reports its compilation."""
+    reporter.compiling()
+    began = time.perf_counter()
+    one = begun.result()
+    waited = time.perf_counter() - began
+    reporter.compiled(one.executor.name, min(one.executor.compile_time, waited))
+    return one
+
+
+def _finish(
+    table: CaseTable, begun: _BegunGroup, reporter: Reporter, stop: threading.Event
+) -> Generator[Done]:
+    """Run the other chunks of a group; each is computed while the previous one is written."""
+    group, executor, running = begun
+    first, *others = group.chunks()
+    pending = first, running
+    try:
+        for chunk in others:
             if stop.is_set():
-                return
+                break
+            previous, pending = pending, (chunk, _start(table, group, executor, chunk))
+            yield _wait_for(group, *previous)
+        if stop.is_set() and reporter.n_run:  # the previous is safe, this one just begun
+            return
+        yield _wait_for(group, *pending)
+    finally:
+        pending[1].cancel()
 
 
 def _wait_for(group: Group, chunk: Chunk, running: Started) -> Done:

@@ -8,12 +8,14 @@ close together. Uses `MARGIN_MODES` plant modes, at rest at the first way-point.
 
 from __future__ import annotations
 
+from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.drives import DRIVES
@@ -141,8 +143,9 @@ def judge_loops(structure: Structure, cases: Case) -> LoopFigures:
         for sweep in SWEEPS:
             if len(rows):
                 rows = judge(rows, sweep)
-    for k in map(int, np.flatnonzero(is_sharp | is_beyond)):
-        _judge_by_eigenvalues(structure, jax.tree.map(lambda x, k=k: x[k], whole), figures, k)
+        by_eigenvalues = partial(_judge_by_eigenvalues, structure, whole, figures)
+        with threadpool_limits(1, "blas"):
+            deque(pool.map(by_eigenvalues, map(int, np.flatnonzero(is_sharp | is_beyond))), 0)
     return figures
 
 
@@ -160,8 +163,9 @@ def _unevenness(cases: Case) -> np.ndarray:
         return np.max(np.nan_to_num(ratio.max(axis=1) / ratio.min(axis=1)), axis=1)
 
 
-def _judge_by_eigenvalues(structure: Structure, case: Case, figures: LoopFigures, k: int) -> None:
-    """Write the figures of one case, except the mode that breaks; takes half a second."""
+def _judge_by_eigenvalues(structure: Structure, cases: Case, figures: LoopFigures, k: int) -> None:
+    """Write the figures of case k, except the mode that breaks; takes half a second."""
+    case = jax.tree.map(lambda x: x[k], cases)
     try:
         one = loop_report(structure, case, case.path.waypoints[0], structure.n_controlled)
     except np.linalg.LinAlgError:  # not finite

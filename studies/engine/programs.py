@@ -15,11 +15,12 @@ from __future__ import annotations
 import gc
 import os
 import pickle
+from collections import defaultdict
 from collections.abc import Callable
 from functools import cache, update_wrapper
 from hashlib import sha256
 from pathlib import Path
-from threading import RLock
+from threading import Lock, RLock
 from typing import Any
 
 import jax
@@ -33,7 +34,9 @@ from studies.kernels import native
 from studies.kernels.compilation import ObjectCache
 from studies.space.free import Placing
 
-_LOCK = RLock()
+_LOCK = Lock()
+#: Held while a program is made, by its name: others are made meanwhile.
+_MAKING: defaultdict[str, RLock] = defaultdict(RLock)
 #: Compiled programs hold some memory mappings each, and LLVM ends a process that wants more than
 #: the 65,530 of Linux. Programs of a sweep or tuning take up to 10,000.
 MOST_MAPPINGS = 20_000
@@ -137,16 +140,18 @@ def program(names: list[Any], arguments: list[Any], lower: Callable[[], Any]) ->
     shapes = [str(jax.typeof(x)) for x in leaves]
     name = repr((names, tree, shapes, str(device_now()), is_keeping()))
     with _LOCK:
-        if name not in _PROGRAMS:
-            _PROGRAMS[name] = _load_or_compile(name, lower)
-        return _PROGRAMS[name]
+        making = _MAKING[name]
+    with making:
+        found = _PROGRAMS.get(name)
+        if found is None:
+            found = _PROGRAMS[name] = _load_or_compile(name, lower)
+        return found
 
 
 def drop_programs() -> None:
     """Forget compiled programs before they become too many; those in use stay."""
     if _mappings() > MOST_MAPPINGS:
-        with _LOCK:
-            _PROGRAMS.clear()
+        _PROGRAMS.clear()
         jax.clear_caches()
         gc.collect()
 
