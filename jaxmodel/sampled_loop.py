@@ -217,17 +217,23 @@ class DelayedParts(NamedTuple):
     forces: Array | None  # place of the forces that a sampled drive holds, (3,), integers
 
 
-def delayed_parts(structure: Structure, case: Case, pose: Array, law: Controller) -> DelayedParts:
-    """Parts of a loop that can be given any delay; arguments as `delayed_loop`."""
-    smooth = structure._replace(has_delay=True, is_smooth=True, feedback="sampled")
-    loop, drive = prepare(smooth, case).loop, DRIVES[structure.drive]
+def delayed_parts(structure: Structure, case: Case, loop: Loop, pose: Array) -> DelayedParts:
+    """Parts of a loop that can be given any delay.
+
+    Args:
+        structure: static choices with feedback "sampled".
+        case: the numbers.
+        loop: of the case, from `prepare`.
+        pose: where to linearise, at rest under the steady load [m, m, rad], (3,).
+    """
+    smooth, drive = structure._replace(has_delay=True, is_smooth=True), DRIVES[structure.drive]
     plant = linearise(smooth, loop, pose, resting(smooth, case), drive.is_sampled)
     analogue = analogue_plant(smooth, plant, case)
     count, n_sensors, dtype = len(analogue.state), 3 * structure.n_patches, analogue.state.dtype
     below = jnp.pad(_queue(n_sensors, dtype), ((count, 0), (count, 0)))
     unmoved = jnp.zeros((len(below), 3), dtype)
     exact = _Sampled(held=below, newest=None, force=unmoved, present=unmoved)
-    step = _Step(smooth, case, loop, law, plant, analogue.filtered, exact)
+    step = _Step(smooth, case, loop, loop.controller, plant, analogue.filtered, exact)
     rest, unpack = step.rest()
     n = len(below)
     places, servo = unpack(jnp.arange(n, n + rest.size, dtype=dtype))

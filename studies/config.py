@@ -183,6 +183,30 @@ def _turn_cache(is_on: bool) -> None:
     reset_cache()  # what JAX has decided when it compiled first
 
 
+_limited: tuple[Lock, list[Any]] = Lock(), []  # threads in it, and at first the limit in force
+
+
+@contextmanager
+def serial_blas() -> Iterator[None]:
+    """NumPy's matrix operations on one thread each: more only slow down many small matrices.
+
+    The limit is one of the process; it ends with the last thread inside.
+    """
+    from threadpoolctl import threadpool_limits
+
+    lock, inside = _limited
+    with lock:
+        inside.append(None if inside else threadpool_limits(1, "blas"))
+    try:
+        yield
+    finally:
+        with lock:
+            if len(inside) > 1:
+                inside.pop()
+            else:
+                inside.pop().restore_original_limits()
+
+
 def start(precision: str = "float64", gpu: bool = False) -> None:
     """Configure and start JAX, as every computing command does.
 

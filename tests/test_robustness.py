@@ -18,10 +18,10 @@ from jaxmodel.linear import linearise, resting
 from jaxmodel.loop_figures import MARGINS, MOST_DELAY, PEAKS, guaranteed_range
 from jaxmodel.prepare import prepare
 from jaxmodel.robustness import margin_at, norm_peaks, search_frequencies
-from jaxmodel.sampled_loop import analogue_plant, closed_loop, delayed_loop
+from jaxmodel.sampled_loop import analogue_plant, closed_loop, delayed_loop, delayed_parts
 from jaxmodel.scaling import best_scaling
 from studies.engine import diagonal_scaling
-from studies.engine.delay_check import delayed_loops
+from studies.engine.delay_check import DelayedLoops
 from studies.engine.loop_gain import loop_gains
 from studies.engine.margins import judge_loops
 from studies.engine.results import read_sweep
@@ -73,7 +73,8 @@ class Loop(NamedTuple):
 
 @partial(jax.jit, static_argnums=0)
 def _both(structure, case):
-    return *response_and_modes(structure, case, POSE), closed_loop(structure, case, POSE)
+    loop = prepare(structure, case).loop
+    return *response_and_modes(structure, case, loop, POSE), closed_loop(structure, case, POSE)
 
 
 @cache
@@ -302,7 +303,9 @@ def test_poles_of_a_later_loop_are_those_of_its_delay(kind):
     cases = jax.tree.map(lambda x: x[None], as_arrays(build_case(study)))
     case = jax.tree.map(lambda x: x[0], cases)
     law = prepare(structure, case).loop.controller
-    loops = delayed_loops(structure, cases)
+    parts = delayed_parts(structure, case, prepare(structure, case).loop, case.path.waypoints[0])
+    each = jax.tree.map(lambda x: np.asarray(x)[None], parts)
+    loops = DelayedLoops.of(each, cases.electronics)
     late = jax.jit(lambda x: delayed_loop(structure, case, case.path.waypoints[0], law, x))
     for delay in (0.0, 0.3, 1.0, 2.625):
         wanted = np.log(radius(np.asarray(late(delay))))
@@ -429,7 +432,8 @@ def test_gradients_are_those_of_differences():
         patches = patches._replace(center=patches.center * x[2])
         machine = case.machine._replace(patches=patches)
         changed = case._replace(control=control, drive=drive, machine=machine)
-        return response_and_modes(structure, changed, POSE)
+        loop = prepare(structure, changed).loop
+        return response_and_modes(structure, changed, loop, POSE)
 
     def places(x):
         one = jax.tree.map(lambda x: np.asarray(x)[None], response(x))

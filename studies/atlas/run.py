@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from threadpoolctl import threadpool_limits
 
 from jaxmodel import status
 from studies import config
@@ -35,6 +34,7 @@ from studies.atlas.subsets import (
     subset_label,
 )
 from studies.atlas.workspace import PAIRS
+from studies.config import serial_blas
 from studies.engine.columns import axis_variables
 from studies.engine.folder import ATLASES, locked_folder, refuse_existing
 from studies.engine.progress import Phases
@@ -136,7 +136,7 @@ def _finish(
             phases.say(text)
 
     phases.begin("analyse")
-    with threadpool_limits(1, "blas"):  # many small matrices: more threads only slow them down
+    with serial_blas():
         findings = evaluate_atlas(study, *found, on_progress)
     phases.begin("draw")
     drawn = FIGURES if findings.subsets is None else FIGURES | MODE_FIGURES

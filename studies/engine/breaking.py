@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from threadpoolctl import threadpool_limits
 
 from jaxmodel.beam import BASES
 from jaxmodel.case import Case, Structure
@@ -19,6 +18,7 @@ from jaxmodel.delay import LONGEST as LONGEST_DELAY
 from jaxmodel.delay import true_delay
 from jaxmodel.laws.srf import SRF
 from jaxmodel.parameters import Array
+from studies.config import serial_blas
 from studies.engine.controller import FixedController
 from studies.engine.host_loop import SampledLoop, name_motion
 from studies.engine.nearest import Loops, nearest_unstable
@@ -154,7 +154,7 @@ def smallest_change(
         np.asarray(ravel_pytree(x)[0]) for x in _limits(structure, case, tolerances)
     )
     found = []
-    with threadpool_limits(1, "blas"):
+    with serial_blas():
         for _, law in linear_parts(design.controller):
             law = law._replace(feedback=law.feedback.without_rivals())
             one = _ChangedLoops(structure, case, pose, law, unit)

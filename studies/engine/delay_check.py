@@ -14,11 +14,9 @@ import numpy as np
 from scipy.linalg import expm, matrix_balance
 from scipy.optimize import minimize_scalar
 
-from jaxmodel.case import Case, Structure
+from jaxmodel.case import Electronics
 from jaxmodel.delay import LONGEST, true_delay
-from jaxmodel.prepare import prepare
-from jaxmodel.sampled_loop import RADIUS_TOLERANCE, DelayedParts, delayed_parts
-from studies.engine.programs import kept_jit
+from jaxmodel.sampled_loop import RADIUS_TOLERANCE, DelayedParts
 
 #: Shares of a delay margin at which the loop must be stable, and one at which it must not be.
 BEFORE, BEYOND = (0.35, 0.7, 0.98), 1.02
@@ -27,12 +25,11 @@ BEFORE, BEYOND = (0.35, 0.7, 0.98), 1.02
 LEVELS, STEPS = 24, 8
 
 
-def checked_delays(structure: Structure, cases: Case, delay: np.ndarray) -> np.ndarray:
+def checked_delays(loops: DelayedLoops, delay: np.ndarray) -> np.ndarray:
     """Delay margins, those that turn out wrong replaced by the edge that poles show.
 
     Args:
-        structure: of loops that are stable as they are, with the plant modes of margins.
-        cases: leaves (n, ...), n as `studies.engine.robustness.BATCH`.
+        loops: stable as they are, with the plant modes of margins.
         delay: as searched, NaN where there is none [samples], (n,).
 
     Returns:
@@ -40,14 +37,7 @@ def checked_delays(structure: Structure, cases: Case, delay: np.ndarray) -> np.n
         `jaxmodel.delay.LONGEST` in all are not looked at: a loop that is stable up to there has
         the margin that was searched, or the delay that leads there if that is larger.
     """
-    loops = delayed_loops(structure, cases)
     return np.array([_checked(loops, k, x, LONGEST - loops.own[k]) for k, x in enumerate(delay)])
-
-
-def delayed_loops(structure: Structure, cases: Case) -> DelayedLoops:
-    """Loops of cases; arguments as `checked_delays`."""
-    period, own = np.asarray(cases.electronics.period), true_delay(cases.electronics)
-    return DelayedLoops.of(_parts(structure, cases), period, np.asarray(own))
 
 
 def _checked(loops: DelayedLoops, k: int, delay: float, room: float) -> float:
@@ -108,7 +98,8 @@ class DelayedLoops(NamedTuple):
     is_finite: np.ndarray  # (n,)
 
     @classmethod
-    def of(cls, parts: DelayedParts, period: np.ndarray, own: np.ndarray) -> DelayedLoops:
+    def of(cls, parts: DelayedParts, electronics: Electronics) -> DelayedLoops:
+        period, own = np.asarray(electronics.period), np.asarray(true_delay(electronics))
         parts = jax.tree.map(np.array, parts)
         both = zip(parts.matrix, parts.state, parts.enters, strict=True)
         is_finite = np.array([all(np.isfinite(x).all() for x in each) for each in both])
@@ -166,13 +157,3 @@ def held_response(
     balanced, (scale, _) = matrix_balance(whole, permute=False, separate=True)
     exact = expm(balanced * time) * scale[:, None] / scale
     return exact[:n, :n], exact[:n, n:]
-
-
-# compiled without optimisation: it takes a fraction of the time
-@kept_jit(static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})
-def _parts(structure: Structure, cases: Case) -> DelayedParts:
-    def one(case: Case) -> DelayedParts:
-        law = prepare(structure, case).loop.controller
-        return delayed_parts(structure, case, case.path.waypoints[0], law)
-
-    return jax.vmap(one)(cases)

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.drives import DRIVES
@@ -42,7 +41,7 @@ from jaxmodel.return_difference import (
     loop_strength,
 )
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
-from studies.config import hosts
+from studies.config import hosts, serial_blas
 from studies.engine.damping import damping_ratios, least_controlled
 from studies.engine.lanes import BLOCK, run_steps
 from studies.engine.programs import kept_jit
@@ -144,7 +143,7 @@ def judge_loops(structure: Structure, cases: Case) -> LoopFigures:
             if len(rows):
                 rows = judge(rows, sweep)
         by_eigenvalues = partial(_judge_by_eigenvalues, structure, whole, figures)
-        with threadpool_limits(1, "blas"):
+        with serial_blas():
             deque(pool.map(by_eigenvalues, map(int, np.flatnonzero(is_sharp | is_beyond))), 0)
     return figures
 

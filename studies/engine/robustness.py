@@ -13,19 +13,20 @@ from typing import Any
 
 import jax
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.frequency_response import SampledLoopResponse, response_of_loop
 from jaxmodel.laws import LAWS
+from jaxmodel.loop import Loop
 from jaxmodel.loop_figures import MARGINS, MOST_DELAY, MOST_PHASE, PEAKS
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.return_difference import assembled_modes
 from jaxmodel.robustness import MarginPlace, norm_peaks
-from studies.config import hosts
+from jaxmodel.sampled_loop import DelayedParts, delayed_parts
+from studies.config import hosts, serial_blas
 from studies.engine.crossings import delay_margins, phase_margins
-from studies.engine.delay_check import checked_delays
+from studies.engine.delay_check import DelayedLoops, checked_delays
 from studies.engine.disk_margin import LARGEST, disk_margins
 from studies.engine.loop_gain import LoopGains, acting_commands, loop_gains
 from studies.engine.margin_grid import GridGain, search_grid
@@ -91,19 +92,21 @@ def _figures_of(
     structure, cases = with_margin_modes(structure, cases)
     whole = jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x)[1:])), cases)
     rows = padded_rows(count, BATCH)
-    parts = np.split(rows, len(rows) // BATCH)
+    batches = np.split(rows, len(rows) // BATCH)
+    has_delay = "delay_margin" in names and not LAWS[structure.law].is_switching
 
     def judge(part: np.ndarray) -> dict[str, np.ndarray]:
         some = jax.tree.map(lambda x: x[part], whole)
-        response, modes = _responses(structure, some)
+        response, modes, parts = _responses(structure, has_delay, some)
         places = find_margins(response, modes, tuple(x for x in names if x in MARGINS))
         margins = {name: place.value for name, place in places.items()}
-        if "delay_margin" in margins and not LAWS[structure.law].is_switching:
-            margins["delay_margin"] = checked_delays(structure, some, margins["delay_margin"])
+        if parts is not None:
+            loops = DelayedLoops.of(parts, some.electronics)
+            margins["delay_margin"] = checked_delays(loops, margins["delay_margin"])
         return margins | _peaks_of(response, tuple(x for x in names if x in PEAKS))
 
-    with threadpool_limits(1, "blas"), ThreadPoolExecutor(len(hosts())) as pool:
-        judged = list(pool.map(judge, parts))
+    with serial_blas(), ThreadPoolExecutor(len(hosts())) as pool:
+        judged = list(pool.map(judge, batches))
     return {name: np.concatenate([part[name] for part in judged])[:count] for name in names}
 
 
@@ -160,18 +163,25 @@ def find_margins(
 
 
 # compiled without optimisation: it takes a fraction of the time
-@kept_jit(static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})
+@kept_jit(static_argnums=(0, 1), compiler_options={"xla_backend_optimization_level": 0})
 def _responses(
-    structure: Structure, cases: Case
-) -> tuple[SampledLoopResponse, tuple[Array, Array]]:
-    return jax.vmap(lambda case: response_and_modes(structure, case, case.path.waypoints[0]))(cases)
+    structure: Structure, has_delay: bool, cases: Case
+) -> tuple[SampledLoopResponse, tuple[Array, Array], DelayedParts | None]:
+    """What the searches read of each loop, and if wanted the check of its delay margin."""
+
+    def one(case: Case) -> tuple[SampledLoopResponse, tuple[Array, Array], DelayedParts | None]:
+        loop, pose = prepare(structure, case).loop, case.path.waypoints[0]
+        parts = delayed_parts(structure, case, loop, pose) if has_delay else None
+        return *response_and_modes(structure, case, loop, pose), parts
+
+    return jax.vmap(one)(cases)
 
 
 def response_and_modes(
-    structure: Structure, case: Case, pose: Array
+    structure: Structure, case: Case, loop: Loop, pose: Array
 ) -> tuple[SampledLoopResponse, tuple[Array, Array]]:
-    """What `find_margins` reads of a loop about rest at a pose."""
-    response = response_of_loop(structure, case, prepare(structure, case).loop, pose)
+    """What `find_margins` reads of a prepared loop about rest at a pose."""
+    response = response_of_loop(structure, case, loop, pose)
     modes = assembled_modes(response.plant)
     return response, (modes.omega, modes.decay)
 

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from jaxmodel.axial import axial_force
 from jaxmodel.case import Case, Structure
@@ -25,6 +24,7 @@ from jaxmodel.motion import PathSample, end_of_path, sample_path
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, loop_matrices
+from studies.config import serial_blas
 from studies.engine.host_loop import SampledLoop, name_motion, sampled_loop
 from studies.engine.programs import kept_jit
 from studies.study.margin import HIGHEST, LOWEST, MARGIN_MODES
@@ -109,7 +109,8 @@ class _Loops(NamedTuple):
     in_motion: LoopMatrices | None  # (k, p, ...)
 
 
-@kept_jit(static_argnums=(0, 1))
+# compiled without optimisation: it takes less time and runs as fast
+@kept_jit(static_argnums=(0, 1), compiler_options={"xla_backend_optimization_level": 0})
 def _loops(
     structure: Structure, has_motion: bool, case: Case, pose: Array, parts: Controller | None
 ) -> _Loops:
@@ -239,7 +240,7 @@ def _figures(
         matrices = jax.tree.map(lambda x: x[place], matrices)
         return sampled_loop(matrices, loops.omega, period, n_tracked)
 
-    with threadpool_limits(1, "blas"):  # many small matrices: more threads only slow them down
+    with serial_blas():
         parts = [judge_loop(loop(loops.at_rest, p)) for p in range(len(modes))]
         figures = worst_figures(list(zip(modes, parts, strict=True)))
         if not has_motion:

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
-from threadpoolctl import threadpool_limits
 
+from studies.config import serial_blas
 from studies.engine.preflight import check_run
 from studies.engine.progress import Phases
 from studies.errors import StudyError
@@ -71,7 +71,7 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
     """
     phases = Phases(console or Console(quiet=True), fit_phases(spec))
     # many small matrices: two threads of BLAS take 1.6 times as long
-    with phases, threadpool_limits(1, "blas"):
+    with phases, serial_blas():
         return suggest(estimate(spec, phases), phases)
 
 

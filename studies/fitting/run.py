@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from threadpoolctl import threadpool_limits
 
+from studies.config import serial_blas
 from studies.engine.folder import FIT
 from studies.engine.progress import Phases
 from studies.engine.run_data import run_attributes
@@ -48,7 +48,7 @@ def run_fit(
     out, console = Path(out), console or Console(highlight=False, markup=False)
     check_folder(out)
     # many small matrices: two threads of BLAS take 1.6 times as long
-    with Phases(console, fit_phases(spec)) as phases, threadpool_limits(1, "blas"):
+    with Phases(console, fit_phases(spec)) as phases, serial_blas():
         fitted = estimate(spec, phases)
         phases.begin("draw")
         with publish(

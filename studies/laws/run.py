@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import json
 import re
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Event, Lock
 
 from rich.console import Console
 
@@ -45,6 +47,8 @@ from studies.study.window import with_window
 DOCUMENT, TUNING, RUNS = "laws.json", "tuning", "runs"
 #: Machines to judge on.
 MACHINES = 16
+#: Candidates that are tuned side by side: a compiler keeps about one core busy.
+TOGETHER = 2
 
 
 def run_laws(
@@ -161,20 +165,35 @@ def _compare(study: Study, out: Path, budget: Budget, phases: Phases) -> LawFind
 
 
 def _tune(study: Study, out: Path, budget: Budget, phases: Phases) -> list[Tuned]:
-    """Each candidate, tuned or not."""
+    """Each candidate, tuned or not; some side by side."""
     phases.begin("tune", "what each law and drive can be tuned by")
     candidates = [*law_candidates(study), *drive_candidates(study)]
-    folder, tuned = out / TUNING, []
+    folder, lock, stop, done = out / TUNING, Lock(), Event(), list[Tuned]()
     folder.mkdir(exist_ok=True)
-    for k, candidate in enumerate(candidates):
 
-        def say(text: str, k: int = k, name: str = candidate.name) -> None:
-            phases.advance(k, len(candidates), f"{name} ({k + 1} of {len(candidates)}): {text}")
+    def tune(k: int) -> Tuned:
+        candidate = candidates[k]
+
+        def say(text: str) -> None:
+            if stop.is_set():
+                raise KeyboardInterrupt
+            with lock:
+                here = f"{candidate.name} ({k + 1} of {len(candidates)})"
+                phases.advance(len(done), len(candidates), f"{here}: {text}")
 
         say("compile")
-        one = tune_candidate(study, candidate, budget, folder / f"{_slug(candidate.name)}.npz", say)
-        tuned.append(one)
-    return tuned
+        file = folder / f"{_slug(candidate.name)}.npz"
+        one = tune_candidate(study, candidate, budget, file, say)
+        done.append(one)
+        return one
+
+    with ThreadPoolExecutor(TOGETHER) as pool:
+        try:
+            return list(pool.map(tune, range(len(candidates))))
+        except BaseException:
+            stop.set()
+            phases.say("stopping after the iterations under way")
+            raise
 
 
 def _slug(name: str) -> str:

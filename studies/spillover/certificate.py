@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from jaxmodel.beam import BASES
 from jaxmodel.controller import linear_parts
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
+from studies.config import serial_blas
 from studies.engine.breaking import BreakingChange
 from studies.engine.controller import FixedController, fixed_controller
 from studies.engine.host_loop import SampledLoop, name_motion
@@ -171,7 +171,7 @@ def certify(
     builder = LoopBuilder(design)
     faults = np.vectorize(builder.fault, otypes=[object])(plants)
     try:
-        with threadpool_limits(1, "blas"):
+        with serial_blas():
             judgements = _judge_plants(design, builder, plants, faults)
     except np.linalg.LinAlgError:
         raise StudyError("a linearised loop is not finite: nothing to judge") from None

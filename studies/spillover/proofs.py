@@ -11,7 +11,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from jaxmodel.beam import BASES
 from jaxmodel.branch_and_bound import Cells, exclude_zeros, start_cells
@@ -20,6 +19,7 @@ from jaxmodel.drives import DRIVES
 from jaxmodel.modal_loop import ModalLoop, modal_loop
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, delayed_loop
 from jaxmodel.zero_exclusion import prepare_exclusion
+from studies.config import serial_blas
 from studies.engine.controller import FixedController
 from studies.engine.programs import kept_jit
 from studies.engine.stability import gain_margin
@@ -141,7 +141,7 @@ def prove(design: FixedController, seconds: float = 60.0) -> Proofs:
         seconds: for the box at most, after compilation.
     """
     laws = [pad_channels(part, design.n_patches) for _, part in linear_parts(design.controller)]
-    with threadpool_limits(1, "blas"):
+    with serial_blas():
         each = [prove_all_modes(design, law) for law in laws]
         boxes = [prove_box(design, law, seconds / len(laws)) for law in laws]
     return Proofs(min(each, key=lambda one: one.margin), max(boxes, key=_weakness))

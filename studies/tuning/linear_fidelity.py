@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from jaxmodel.case import Structure
 from jaxmodel.loop_figures import MARGINS, PEAKS
 from jaxmodel.parameters import Array
+from studies.config import serial_blas
 from studies.engine.plan import padded_rows
 from studies.engine.robustness import find_margins
 from studies.errors import StudyError
@@ -273,7 +273,7 @@ class LinearFidelity:
         program = evaluate.__qualname__, batch.structure, size
         cores = os.cpu_count() if program in self._compiled else 1
         self._compiled.add(program)
-        with threadpool_limits(1, "blas"), ThreadPoolExecutor(cores) as pool:
+        with serial_blas(), ThreadPoolExecutor(cores) as pool:
             results = list(pool.map(lambda part: jax.tree.map(np.asarray, evaluate(part)), parts))
         return tuple(np.concatenate(x)[:count] for x in zip(*results, strict=True))
 

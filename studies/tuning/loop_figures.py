@@ -14,7 +14,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.kinematics import singularity_distance
@@ -22,6 +21,7 @@ from jaxmodel.loop_figures import MARGINS, PEAKS
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopMatrices, closed_loop, spillover
+from studies.config import serial_blas
 from studies.engine.columns import ON_DEMAND
 from studies.engine.programs import kept_jit
 from studies.engine.robustness import judge_robustness
@@ -133,7 +133,7 @@ def figures_of_cases(
         one = jax.tree.map(lambda x: x[k % len(x)], cases)
         return _figures_of_case(structure, as_arrays(one), plain)
 
-    with threadpool_limits(1, "blas"), ThreadPoolExecutor(os.cpu_count()) as pool:
+    with serial_blas(), ThreadPoolExecutor(os.cpu_count()) as pool:
         each = list(pool.map(judge, range(count if plain else 0)))
     figures = {name: np.array([one[name] for one in each]) for name in plain}
     if of_response:

@@ -10,12 +10,13 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.frequency_response import SampledLoopResponse, response_of_loop
+from jaxmodel.linear import resting
 from jaxmodel.linear_residual import linear_residual
 from jaxmodel.loop_figures import MARGINS, PEAKS
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.robustness import MarginPlace, margin_at, norm_peaks
-from jaxmodel.sampled_loop import LoopMatrices, closed_loop, slowest_decay, spillover
+from jaxmodel.sampled_loop import LoopMatrices, loop_matrices, slowest_decay, spillover
 from studies.engine.programs import kept_jit
 from studies.engine.robustness import response_and_modes
 from studies.study.cases import case_of
@@ -86,10 +87,11 @@ def _loop(
     structure: Structure, case: Case, names: tuple[Any, ...], places: dict[str, MarginPlace]
 ) -> _Loop:
     """A loop with its named figures of the frequency response, margins at their places."""
-    pose = case.path.waypoints[0]
-    matrices, figures = closed_loop(structure, case, pose), {}
+    pose, loop, figures = case.path.waypoints[0], prepare(structure, case).loop, {}
+    moment = resting(structure, case)
+    matrices = loop_matrices(structure, case, loop, loop.controller, pose, moment)
     if places or any(name in PEAKS for name in names):
-        response = response_of_loop(structure, case, prepare(structure, case).loop, pose)
+        response = response_of_loop(structure, case, loop, pose)
         figures = {name: margin_at(response, name, place) for name, place in places.items()}
         peaks = tuple(name for name in PEAKS if name in names)
         figures |= norm_peaks(response, peaks) if peaks else {}
@@ -110,7 +112,8 @@ def loop_responses(
 
     def one(x: Array, numbers: Numbers) -> tuple[SampledLoopResponse, tuple[Array, Array]]:
         case = case_of(structure, place(numbers, x))
-        return response_and_modes(structure, case, case.path.waypoints[0])
+        loop = prepare(structure, case).loop
+        return response_and_modes(structure, case, loop, case.path.waypoints[0])
 
     return jax.vmap(one)(values, numbers)
 
