@@ -86,7 +86,15 @@ def loop_matrices(
     plant = linearise(smooth, loop, pose, moment, drive.is_sampled)
     analogue = analogue_plant(smooth, plant, case)
     exact = _over_a_sample(smooth, analogue, case)
-    step = _Step(smooth, case, loop, law, plant, analogue.filtered, exact)
+    step = _Step(
+        structure=smooth,
+        case=case,
+        loop=loop,
+        law=law,
+        plant=plant,
+        filtered=analogue.filtered,
+        exact=exact,
+    )
     no_reference = jnp.zeros((6,), analogue.state.dtype)
     rest, unpack = step.rest()
     n = len(exact.held)
@@ -233,7 +241,15 @@ def delayed_parts(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
     below = jnp.pad(_queue(n_sensors, dtype), ((count, 0), (count, 0)))
     unmoved = jnp.zeros((len(below), 3), dtype)
     exact = _Sampled(held=below, newest=None, force=unmoved, present=unmoved)
-    step = _Step(smooth, case, loop, loop.controller, plant, analogue.filtered, exact)
+    step = _Step(
+        structure=smooth,
+        case=case,
+        loop=loop,
+        law=loop.controller,
+        plant=plant,
+        filtered=analogue.filtered,
+        exact=exact,
+    )
     rest, unpack = step.rest()
     n = len(below)
     places, servo = unpack(jnp.arange(n, n + rest.size, dtype=dtype))

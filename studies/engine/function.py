@@ -28,7 +28,7 @@ from jaxmodel.loop import State, step
 from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import Outline, Result, Start, begin, conclude
 from studies.config import is_keeping, processor
-from studies.engine.programs import is_plain, kept_data, program
+from studies.engine.programs import is_plain, kept_data, program, quick_options
 from studies.errors import NoKernelError, warn_of_scan
 from studies.kernels import bridge, gpu, llvm, native
 from studies.kernels.differentiable import DifferentiableLoop
@@ -108,9 +108,7 @@ class BlockFunction:
         )
         self._programs: dict[str, Any] = {}
         self._compiling = Lock()
-        # run once, so compiled without optimisation: saves a quarter of two to four seconds
-        options = {"xla_backend_optimization_level": 0}
-        common = self._program("shared", partial(self._leaves, False), *first, options=options)
+        common = self._program("shared", partial(self._leaves, False), *first)
         self.shared = [np.asarray(x, order="C") for x in common]
         TRACES.append(structure)
         loops: dict[str, Callable[[], Any]]
@@ -282,17 +280,14 @@ class BlockFunction:
         if isinstance(self._step_all, DifferentiableLoop):
             self._step_all.note_run(time.perf_counter() - began)
 
-    def _program(
-        self, name: str, function: Callable[..., Any], *arguments: Any, options: Any = None
-    ) -> Any:
+    def _program(self, name: str, function: Callable[..., Any], *arguments: Any) -> Any:
         """Result of a program that prepares cases."""
-        compiled = self._compiled(name, function, *arguments, options=options)
-        return jax.block_until_ready(compiled(*arguments))
+        return jax.block_until_ready(self._compiled(name, function, *arguments)(*arguments))
 
-    def _compiled(
-        self, name: str, function: Callable[..., Any], *arguments: Any, options: Any = None
-    ) -> Any:
+    def _compiled(self, name: str, function: Callable[..., Any], *arguments: Any) -> Any:
         def lower() -> Any:
+            is_quick = self.kind == "kernel" and not name.startswith("finish")  # which steps
+            options = quick_options() if is_quick else None
             return jax.jit(function, compiler_options=options).lower(*arguments)
 
         with self._compiling:

@@ -243,8 +243,7 @@ def _judge_block(
         return _judged(response, modes, np.maximum(strength / STRONG, 1.0), sweep, ratio)
 
 
-# compiled without optimisation: it takes a fiftieth of the time
-@kept_jit(static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})
+@kept_jit(static_argnums=0, is_quick=True)
 def _respond(structure: Structure, cases: Case) -> tuple[LoopResponse, AssembledModes, Any]:
     """The loops, their modes and their strength, lanes last."""
 

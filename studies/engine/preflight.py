@@ -73,7 +73,7 @@ def preflight(structure: Structure, case: Case) -> Preflight:
     return jax.tree.map(np.asarray, _preflight(_without_run(structure), case))
 
 
-@kept_jit(static_argnums=0)
+@kept_jit(static_argnums=0, is_quick=True)
 def _preflight(structure: Structure, case: Case) -> Preflight:
     prepared = prepare(structure, case)
     plant = prepared.loop.plant

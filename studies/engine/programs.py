@@ -17,7 +17,8 @@ import os
 import pickle
 from collections import defaultdict
 from collections.abc import Callable
-from functools import cache, update_wrapper
+from contextlib import suppress
+from functools import cache, cached_property, update_wrapper
 from hashlib import sha256
 from pathlib import Path
 from threading import Lock, RLock
@@ -44,25 +45,51 @@ MOST_MAPPINGS = 20_000
 _PROGRAMS: dict[str, Any] = {}
 
 
+#: Compiler options from the quickest to compile: with the first it takes a fifth of XLA's default
+#: time, with the second half of it, for about the same run time. Not for every program: a scan over
+#: time runs seven times slower, and a derivative with many shared terms can take minutes to
+#: compile. jaxlib 0.11 does not know the first.
+_QUICK: tuple[dict[str, Any], ...] = (
+    {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False},
+    {"xla_backend_optimization_level": 0},
+)
+
+
+@cache
+def quick_options() -> dict[str, Any]:
+    """Compiler options for programs on this machine's cores that are used for a few cases."""
+    with on_host():
+        lowered = jax.jit(lambda: 0).lower()
+        for options in _QUICK[:-1]:
+            with suppress(RuntimeError, ValueError):  # an option that this jaxlib does not know
+                lowered.compile(compiler_options=options)
+                return options
+    return _QUICK[-1]
+
+
 class KeptFunction:
     """A function whose programs are kept, made by `kept_jit`; they run on this machine's cores."""
 
     def __init__(
-        self,
-        function: Callable[..., Any],
-        static: tuple[int, ...],
-        compiler_options: dict[str, Any] | None,
+        self, function: Callable[..., Any], static: tuple[int, ...], is_quick: bool
     ) -> None:
         update_wrapper(self, function)
         self._name = f"{function.__module__}.{function.__qualname__}"
         self._static = static  # ascending
-        self._jit = jax.jit(function, static_argnums=static, compiler_options=compiler_options)
+        self._is_quick = is_quick
+        self._function = function
+        self._inner = jax.jit(function, static_argnums=static)  # as a part of another program
+
+    @cached_property
+    def _jit(self) -> Any:
+        options = quick_options() if self._is_quick else None
+        return jax.jit(self._function, static_argnums=self._static, compiler_options=options)
 
     def __call__(self, *arguments: Any) -> Any:
         fixed, free = self._split(arguments)
         is_traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(free))
         if is_traced:
-            return self._jit(*arguments)
+            return self._inner(*arguments)
         with on_host():
             if not self._is_kept(fixed):
                 return self._jit(*arguments)
@@ -97,7 +124,7 @@ class KeptFunction:
 
 
 def kept_jit(
-    static_argnums: int | tuple[int, ...] = (), compiler_options: dict[str, Any] | None = None
+    static_argnums: int | tuple[int, ...] = (), is_quick: bool = False
 ) -> Callable[[Callable[..., Any]], KeptFunction]:
     """`jax.jit` whose programs are kept, and run on this machine's cores: GPUs are for many cases.
 
@@ -105,7 +132,7 @@ def kept_jit(
         static_argnums: arguments that are part of the program. With others than numbers, texts,
             tuples of them and `Placing`, the program is not kept: no name tells a function from
             another.
-        compiler_options: as for `jax.jit`.
+        is_quick: compiled with `quick_options`.
 
     Example:
         >>> @kept_jit(static_argnums=0)
@@ -113,7 +140,7 @@ def kept_jit(
         ...     return x**n
     """
     static = (static_argnums,) if isinstance(static_argnums, int) else static_argnums
-    return lambda function: KeptFunction(function, static, compiler_options)
+    return lambda function: KeptFunction(function, static, is_quick)
 
 
 def is_plain(x: Any) -> bool:

@@ -162,8 +162,7 @@ def find_margins(
     return found
 
 
-# compiled without optimisation: it takes a fraction of the time
-@kept_jit(static_argnums=(0, 1), compiler_options={"xla_backend_optimization_level": 0})
+@kept_jit(static_argnums=(0, 1), is_quick=True)
 def _responses(
     structure: Structure, has_delay: bool, cases: Case
 ) -> tuple[SampledLoopResponse, tuple[Array, Array], DelayedParts | None]:

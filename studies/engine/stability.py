@@ -109,8 +109,7 @@ class _Loops(NamedTuple):
     in_motion: LoopMatrices | None  # (k, p, ...)
 
 
-# compiled without optimisation: it takes less time and runs as fast
-@kept_jit(static_argnums=(0, 1), compiler_options={"xla_backend_optimization_level": 0})
+@kept_jit(static_argnums=(0, 1), is_quick=True)
 def _loops(
     structure: Structure, has_motion: bool, case: Case, pose: Array, parts: Controller | None
 ) -> _Loops:

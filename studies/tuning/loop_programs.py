@@ -26,8 +26,6 @@ from studies.tuning.loop_figures import distance_of_path
 #: Unit of violations of `gain_margin`, and the decay rate that counts as stable if no limit of the
 #: loop is set [1/s].
 STABLE = 10.0
-#: Compiled without optimisation: that takes half the time, and the programs run as fast.
-QUICK = {"xla_backend_optimization_level": 0}
 
 
 class _Loop(NamedTuple):
@@ -104,7 +102,7 @@ def _loop(
     )
 
 
-@kept_jit(static_argnums=(0, 1), compiler_options=QUICK)
+@kept_jit(static_argnums=(0, 1), is_quick=True)
 def loop_responses(
     structure: Structure, place: Any, numbers: Numbers, values: Array
 ) -> tuple[SampledLoopResponse, tuple[Array, Array]]:
@@ -127,7 +125,7 @@ def tuned_cases(structure: Structure, place: Any, numbers: Numbers, values: Arra
     return cases
 
 
-@kept_jit(static_argnums=(0, 1, 2, 3), compiler_options=QUICK)
+@kept_jit(static_argnums=(0, 1, 2, 3), is_quick=True)
 def figure_slopes(
     structure: Structure,
     names: tuple[Any, ...],
@@ -155,7 +153,7 @@ def figure_slopes(
     return jax.lax.map(one, (values, numbers, limits, places))
 
 
-@kept_jit(static_argnums=(0, 1, 2, 5), compiler_options=QUICK)
+@kept_jit(static_argnums=(0, 1, 2, 5), is_quick=True)
 def screen_designs(
     structure: Structure,
     names: tuple[Any, ...],
