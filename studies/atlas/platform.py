@@ -20,6 +20,7 @@ from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, loop_matrices
 from studies.atlas.subsets import link_label, long_enough
 from studies.engine.batches import run_batches
+from studies.engine.eigenvalues import eigenvalues
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
 from studies.engine.runs import resolved_study
@@ -157,7 +158,7 @@ def responses(study: Study, frequency: np.ndarray) -> Responses:
     for links in LINK_SETS:
         matrices, jacobian = _linear(structure, _with_links(case, links), pose)
         transition = np.asarray(matrices.open + matrices.feedback)
-        radius.append(np.abs(np.linalg.eigvals(transition)).max())
+        radius.append(np.abs(eigenvalues(transition)).max())
         response = _response(
             matrices, transition, jacobian, frequency / study.electronics.sample_rate_hz
         )

@@ -17,6 +17,7 @@ from scipy.optimize import minimize_scalar
 from jaxmodel.case import Electronics
 from jaxmodel.delay import LONGEST, true_delay
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, DelayedParts
+from studies.engine.eigenvalues import eigenvalues
 
 #: Shares of a delay margin at which the loop must be stable, and one at which it must not be.
 BEFORE, BEYOND = (0.35, 0.7, 0.98), 1.02
@@ -117,7 +118,7 @@ class DelayedLoops(NamedTuple):
         """Logarithm of the spectral radius of loop k with a further delay [samples]."""
         matrix = self.parts.matrix[k].copy()
         matrix[: len(self.held[k])] += self._commanded(k, self.own[k] + delay)
-        return float(np.log(np.abs(np.linalg.eigvals(matrix)).max()))
+        return float(np.log(np.abs(eigenvalues(matrix)).max()))
 
     def _commanded(self, k: int, delay: float) -> np.ndarray:
         """What commands, now or earlier, do to plant and electronics over a sample, (a, m)."""

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices
+from studies.engine.eigenvalues import eigenvalues
 
 #: A mode or link with this share of the largest one's energy is named with it [1].
 PART = 1 / 3
@@ -34,7 +35,7 @@ class SampledLoop(NamedTuple):
 
     def poles(self, factor: float) -> np.ndarray:
         """Discrete poles with all gains times a factor, (n,)."""
-        return np.linalg.eigvals(self.open + factor * self.feedback)
+        return eigenvalues(self.open + factor * self.feedback)
 
 
 def sampled_loop(

@@ -19,6 +19,7 @@ from scipy.linalg import eig
 from scipy.optimize import brentq
 
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
+from studies.engine.eigenvalues import eigenvalues
 
 #: Motions that begin, those nearest to the limit, by steps so far from zero [tolerances].
 MOTIONS, BEGINNING, RADIUS = 20, 2, 4.0
@@ -71,7 +72,7 @@ def growth(matrix: np.ndarray) -> float:
     """
     if not np.all(np.isfinite(matrix)):
         return float("nan")
-    return float(np.log(np.abs(np.linalg.eigvals(matrix)).max()) - np.log1p(RADIUS_TOLERANCE))
+    return float(np.log(np.abs(eigenvalues(matrix)).max()) - np.log1p(RADIUS_TOLERANCE))
 
 
 def nearest_unstable(loops: Loops) -> np.ndarray | None:

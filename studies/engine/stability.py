@@ -17,6 +17,7 @@ import numpy as np
 from jaxmodel.axial import axial_force
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, linear_parts
+from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.imsc import IMSC
 from jaxmodel.linear import Moment, resting
@@ -87,8 +88,15 @@ def with_margin_modes(
         is_smooth=True,
         feedback="sampled",
         has_position_gain=True,
+        drive=_about_rest(structure.drive),
     )
     return structure, case
+
+
+def _about_rest(drive: str) -> str:
+    """The drive whose small motions about rest are the same: PD if it only adds feed-forward."""
+    law, plain = DRIVES[drive], DRIVES["pd"]
+    return plain.name if law.force is plain.force and not law.is_sampled else drive
 
 
 def modes_alone(structure: Structure, cases: Case) -> list[tuple[Structure, Case]]:

@@ -38,7 +38,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     ) -> None:
         """Compare control laws and drives, each tuned to one budget, on machines they never saw.
 
-        Takes about 35 minutes on two cores; --resume continues an interrupted comparison.
+        Takes about 20 minutes on two cores; --resume continues an interrupted comparison.
         """
         from studies.engine.folder import COMPARISONS, refuse_existing
 

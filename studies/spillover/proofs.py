@@ -21,6 +21,7 @@ from jaxmodel.sampled_loop import RADIUS_TOLERANCE, delayed_loop
 from jaxmodel.zero_exclusion import prepare_exclusion
 from studies.config import serial_blas
 from studies.engine.controller import FixedController
+from studies.engine.eigenvalues import eigenvalues
 from studies.engine.programs import kept_jit
 from studies.engine.stability import gain_margin
 from studies.spillover.plants import (
@@ -326,4 +327,4 @@ class SpectralRadius:
         matrix = _delayed_loop(
             self._structure, case, self._pose, self._law, jnp.asarray(float(delay))
         )
-        return float(np.abs(np.linalg.eigvals(np.asarray(matrix))).max())
+        return float(np.abs(eigenvalues(np.asarray(matrix))).max())

@@ -23,6 +23,7 @@ from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopMatrices, closed_loop, spillover
 from studies.config import serial_blas
 from studies.engine.columns import ON_DEMAND
+from studies.engine.eigenvalues import eigenvalues
 from studies.engine.programs import kept_jit
 from studies.engine.robustness import judge_robustness
 from studies.engine.stability import gain_margin
@@ -155,7 +156,7 @@ def _figures_of_case(structure: Structure, case: Case, names: set[str]) -> dict[
         return dict.fromkeys(names, np.nan)
 
     def poles(factor: float) -> np.ndarray:
-        return np.linalg.eigvals(open_loop + factor * feedback)
+        return eigenvalues(open_loop + factor * feedback)
 
     if "gain_margin" in names:
         figures["gain_margin"] = gain_margin(poles)
