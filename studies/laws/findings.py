@@ -14,7 +14,7 @@ from studies.engine.preflight import check_run
 from studies.errors import StudyError
 from studies.export.cost import products_of
 from studies.laws.candidates import AS_GIVEN
-from studies.laws.judging import FIGURES, Judged, changes
+from studies.laws.judging import FIGURES, MOVES, Judged, changes
 from studies.laws.ranking import RESAMPLES, Ranking, geometric_mean, rank
 from studies.laws.tuning import Budget, Tuned
 from studies.publish import shown
@@ -214,15 +214,17 @@ def beyond_budget(findings: LawFindings, k: int) -> str:
     judged, budget = findings.judged, findings.budget
     if k not in findings.competing:
         return ""
-    volts = np.nanmax(judged.metrics["peak_voltage"][k], initial=0.0)
-    margins = judged.margins["disk_margin"][k]
-    least = np.nanmin(margins, initial=np.inf)
-    parts = []
-    if volts > TOLERANCE * budget.voltage:
-        parts.append(f"up to {volts:.3g} V instead of {budget.voltage:.3g} V")
+    volts = np.nanmax(judged.metrics["peak_voltage"][k], axis=0, initial=0.0)  # of each move
+    least = np.nanmin(judged.margins["disk_margin"][k], initial=np.inf)
+    peaks = [
+        f"{peak:.3g} V{'' if share == 1 else f' at {share:g} of the move time'}"
+        for share, peak in zip(MOVES, volts, strict=True)
+        if peak > TOLERANCE * budget.voltage
+    ]
+    parts = [f"up to {', '.join(peaks)} (tuned to {budget.voltage:.3g} V)"] if peaks else []
     if TOLERANCE * least < budget.margin:
-        parts.append(f"a disk margin down to {least:.3g} instead of {budget.margin:.3g}")
-    return f"On machines it was not tuned on it has {' and '.join(parts)}." if parts else ""
+        parts.append(f"a disk margin down to {least:.3g} (tuned to {budget.margin:.3g})")
+    return f"On machines and moves that it was not tuned on: {', '.join(parts)}." if parts else ""
 
 
 def _resolution(findings: LawFindings) -> str:
