@@ -235,7 +235,7 @@ def test_a_comparison_writes_a_page_whose_order_is_that_of_the_runs(tmp_path, mo
     assert beyond_budget(findings, 3) == ""
     tight = findings._replace(budget=findings.budget._replace(voltage=1e-3, margin=1.99))
     text = beyond_budget(tight, 3)
-    assert "(tuned to 0.001 V)" in text and "a disk margin down to" in text
+    assert "(tuned to 0.001 V)" in text and "a disk margin below 1.99 on" in text
     html = findings._repr_html_()
     assert "strong + PD" in html and html.count("data:image/png;base64,") == 1
     with pytest.raises(StudyError, match="another design, budget or program"):

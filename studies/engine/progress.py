@@ -138,7 +138,8 @@ class Reporter:
         self.executor = executor
         self.n_compiled += 1
         self.compile_time += seconds
-        self.say(f"executor: {executor}, compiled in {seconds:.1f} s")
+        waited = f", compiled in {seconds:.1f} s" if seconds >= 0.05 else ""
+        self.say(f"executor: {executor}{waited}")
         self.phases.begin(self.name)
 
     def chunk(self, codes: np.ndarray) -> None:

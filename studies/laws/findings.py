@@ -88,8 +88,8 @@ def find(
     """
     products: dict[str, int | None] = {}
     for entry in entries:
-        if entry.law not in products:
-            products[entry.law] = _products(entry.study)
+        if _controller(entry) not in products:
+            products[_controller(entry)] = _products(entry.study)
     findings = LawFindings(
         study=study,
         budget=budget,
@@ -97,7 +97,7 @@ def find(
             _with_stability(entry, margin)
             for entry, margin in zip(entries, judged.margins["gain_margin"], strict=True)
         ],
-        products=[products[entry.law] for entry in entries],
+        products=[products[_controller(entry)] for entry in entries],
         failed=[x for x in tuned if x.study is None],
         judged=judged,
         rankings={},
@@ -155,6 +155,11 @@ def _combined(study: Study, law: Tuned, drive: Tuned) -> Combination:
     )
 
 
+def _controller(entry: Combination) -> str:
+    """What combinations with the same law share; what was given has its own."""
+    return entry.law or entry.name
+
+
 def _products(study: Study) -> int | None:
     """Multiplications a sample of a controller, None without control."""
     return products_of(fixed_controller(study).channels) if study.is_controlled else None
@@ -182,7 +187,8 @@ def verdict(findings: LawFindings) -> list[str]:
         "resamplings of the machines."
     ]
     others = [_other(findings, name) for name in list(FIGURES)[1:]]
-    every = [*_equals(findings), _own_law(findings), *others, beyond_budget(findings, row)]
+    beyond = beyond_budget(findings, row), _best_with_margin(findings)
+    every = [*_equals(findings), _own_law(findings), *others, *beyond]
     return [*filter(None, [_resolution(findings)]), *lines, *filter(None, every)]
 
 
@@ -204,8 +210,8 @@ def _equals(findings: LawFindings) -> list[str]:
     return [
         f"Within {100 * (CLOSE - 1):.0f} % of it, or not to be told from it on these machines: "
         f"{names}. Among all these, {frugal} needs the least control energy ({min(energy):.3g} "
-        f"V² s), {small} the fewest products a sample ({min(products)}), and {robust} has the "
-        f"largest disk margin ({max(margin):.3g})."
+        f"V² s), {small} the fewest multiplications per sample ({min(products)}), and {robust} has "
+        f"the largest disk margin ({max(margin):.3g})."
     ]
 
 
@@ -215,16 +221,37 @@ def beyond_budget(findings: LawFindings, k: int) -> str:
     if k not in findings.competing:
         return ""
     volts = np.nanmax(judged.metrics["peak_voltage"][k], axis=0, initial=0.0)  # of each move
-    least = np.nanmin(judged.margins["disk_margin"][k], initial=np.inf)
+    margins = judged.margins["disk_margin"][k]
+    is_below = margins * TOLERANCE < budget.margin
     peaks = [
         f"{peak:.3g} V{'' if share == 1 else f' at {share:g} of the move time'}"
         for share, peak in zip(MOVES, volts, strict=True)
         if peak > TOLERANCE * budget.voltage
     ]
     parts = [f"up to {', '.join(peaks)} (tuned to {budget.voltage:.3g} V)"] if peaks else []
-    if TOLERANCE * least < budget.margin:
-        parts.append(f"a disk margin down to {least:.3g} (tuned to {budget.margin:.3g})")
+    if is_below.any():
+        where = f"on {is_below.sum()} of {len(margins)} machines"
+        parts.append(
+            f"a disk margin below {budget.margin:.3g} {where}, down to {np.nanmin(margins):.3g}"
+        )
     return f"On machines and moves that it was not tuned on: {', '.join(parts)}." if parts else ""
+
+
+def _best_with_margin(findings: LawFindings) -> str:
+    """The best controller that keeps the disk margin on every machine, if the best one does not."""
+    ranking, rows = findings.ranking, findings.competing
+    margin = np.nanmin(findings.judged.margins["disk_margin"][rows], axis=1)
+    keeps = np.isfinite(ranking.ratio) & (TOLERANCE * margin >= findings.budget.margin)
+    if keeps[ranking.best]:
+        return ""
+    k = next((int(k) for k in ranking.order if keeps[k]), None)
+    if k is None:
+        return "No controller keeps the disk margin on every machine."
+    return (
+        f"Of those that keep the disk margin on every machine, {findings.name(k)} leaves the least "
+        f"residual vibration, {ranking.ratio[k]:.2f} times as much ({ranking.low[k]:.2f} to "
+        f"{ranking.high[k]:.2f}), with a disk margin of {margin[k]:.3g} or more."
+    )
 
 
 def _resolution(findings: LawFindings) -> str:
@@ -233,7 +260,7 @@ def _resolution(findings: LawFindings) -> str:
     adc_step = frame_of(*check_run(study)).adc_step
     step = least_step("residual_rms", adc_step, controlled_links([study]))
     means = [geometric_mean(judged.metrics["residual_rms"][k]) for k in findings.competing]
-    return resolution_text("Mean residual_rms", np.array(means), step, "controller")
+    return resolution_text("Mean residual vibrations", np.array(means), step, "controller")
 
 
 def _own_law(findings: LawFindings) -> str:
@@ -261,8 +288,9 @@ def _other(findings: LawFindings, metric: str) -> str:
     chosen, words = findings.ranking.best, FIGURES[metric]
     if ranking.best == chosen or ranking.is_tied[chosen]:
         return f"By {words} the verdict stands."
+    more = findings.ranking.ratio[ranking.best]
     return (
-        f"By {words} it does not: {findings.name(ranking.best)} is better there, "
-        f"{findings.name(chosen)} has {ranking.ratio[chosen]:.2f} times as much "
-        f"({ranking.low[chosen]:.2f} to {ranking.high[chosen]:.2f})."
+        f"By {words} it does not: {findings.name(ranking.best)} is better there, with {more:.3g} "
+        f"times the residual vibration; {findings.name(chosen)} has {ranking.ratio[chosen]:.2f} "
+        f"times as much ({ranking.low[chosen]:.2f} to {ranking.high[chosen]:.2f})."
     )

@@ -14,6 +14,8 @@ from studies.show.units import readable
 
 #: Rows of a figure at most; the table has them all.
 MOST = 12
+#: Of the moves, the fastest first.
+SHADES = ("#08306B", "#2171B5", "#6BAED6")
 
 
 def comparison(findings: LawFindings) -> Figure:
@@ -33,12 +35,19 @@ def comparison(findings: LawFindings) -> Figure:
     factor, unit = readable("m")
     values = factor * findings.judged.metrics["residual_rms"]
     for y, k in enumerate(order):
-        cloud = np.ravel(values[rows[k]])
-        left.plot(cloud, np.full(cloud.size, y), "o", markersize=2.5, alpha=0.5, color="#0072B2")
-        left.plot(geometric_mean(cloud), y, "|", markersize=12, markeredgewidth=2, color="#000000")
+        for cloud, shade in zip(values[rows[k]].T, SHADES, strict=True):
+            left.plot(cloud, np.full(cloud.size, y), "o", markersize=2.5, alpha=0.6, color=shade)
+        left.plot(
+            geometric_mean(values[rows[k]]),
+            y,
+            "|",
+            markersize=12,
+            markeredgewidth=2,
+            color="#000000",
+        )
     figures.log_scale(left, "x")
     left.set_yticks(range(len(order)), names)
-    left.set_xlabel(f"residual rms [{unit}]")
+    left.set_xlabel(f"residual rms [{unit}]; darker: faster move")
     for place, (metric, color) in enumerate(zip(FIGURES, figures.SERIES, strict=False)):
         one = findings.rankings[metric]
         at = np.arange(len(order)) - 0.16 * (place - (len(FIGURES) - 1) / 2)
@@ -56,7 +65,7 @@ def comparison(findings: LawFindings) -> Figure:
     right.axvline(1.0, color="#666666", linewidth=0.8)
     figures.log_scale(right, "x")
     right.set_yticks(range(len(order)), [])
-    right.set_xlabel("over the best by each figure [1]")
+    right.set_xlabel("ratio to the best by each figure [1]")
     for ax in (left, right):
         ax.set_ylim(-0.6, len(order) - 0.4)
     figures.legend_above(figure, right)
@@ -85,7 +94,7 @@ def grid(findings: LawFindings) -> Figure:
             ax.imshow(values, norm=LogNorm(), cmap="Blues", alpha=0.5, aspect="auto")
         for i, row in enumerate(values):
             for j, value in enumerate(row):
-                text = f"{value:.2g}" if np.isfinite(value) else "-"
+                text = f"{value:.3g}" if np.isfinite(value) else "-"
                 ax.text(j, i, text, ha="center", va="center", fontsize=figures.SMALL)
         ax.set_xticks(range(len(drives)), drives, rotation=25, ha="right")
         ax.set_yticks(range(len(laws)), laws if metric == "residual_rms" else [])

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxmodel import status
 from studies.laws.findings import LawFindings, beyond_budget, verdict
 from studies.laws.judging import FIGURES, MOVES, longer
 from studies.laws.machines import spread_of
@@ -47,8 +48,8 @@ LOOP_HEADS = (
     "phase margin, worst [deg]",
     "delay margin, worst [samples]",
     "breaks first, on the machine with the least gain margin",
-    "products a sample",
-    "numbers tuned",
+    "multiplications per sample",
+    "tuned parameters",
 )
 
 
@@ -98,20 +99,27 @@ def _order(findings: LawFindings) -> list[int]:
 def _row(findings: LawFindings, k: int) -> list[str]:
     controller, judged = findings.controllers[k], findings.judged
     values = {name: _over(judged.metrics[name][k], over) for name, _, over in COLUMNS}
-    lost = int(judged.n_lost[k])
-    parts = controller.reason, f"{lost} runs lost" if lost else "", beyond_budget(findings, k)
+    parts = controller.reason, _incidents(judged.status[k]), beyond_budget(findings, k)
     note = "; ".join(filter(None, parts))
+    is_limited = values["peak_voltage"] >= findings.study.electronics.voltage_limit
     return [
         controller.name,
         number(values["residual_rms"], "m"),
         _ratio(findings, k),
         number(values["settling_time"], "s"),
         number(values["pose_error_peak"], "m"),
-        number(values["peak_voltage"], "V"),
+        number(values["peak_voltage"], "V") + (" (the limit)" if is_limited else ""),
         f"{_rms_voltage(findings, k):.3g}",
         f"{values['control_energy']:.3g}",
         note or "-",
     ]
+
+
+def _incidents(codes: np.ndarray) -> str:
+    """What happened in how many runs, in words; "" if all are in order."""
+    found, counts = np.unique(codes[codes != status.OK], return_counts=True)
+    each = zip(found.tolist(), counts.tolist(), strict=True)
+    return "; ".join(f"{status.REASONS[code]} in {n} of {codes.size} runs" for code, n in each)
 
 
 def _loop_row(findings: LawFindings, k: int) -> list[str]:
