@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import threading
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +21,7 @@ from studies import __version__
 from studies.atlas.commands import add_commands as add_atlas
 from studies.bench.commands import add_commands as add_bench
 from studies.cache import KINDS, VARIABLE, Kept, cache_contents, is_shared
-from studies.config import PACKAGE, configure, keep_programs, start
+from studies.config import COMPILING, PACKAGE, configure, keep_programs, start
 from studies.errors import OWN_WARNINGS, StudyError, printable
 from studies.export.commands import add_commands as add_export
 from studies.fitting.commands import add_commands as add_fit
@@ -77,6 +78,10 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(2)
     except (KeyboardInterrupt, Abort):
         print("studies: interrupted", file=sys.stderr)
+        sys.stdout.flush()
+        sys.stderr.flush()
+        if _is_compiling():  # nobody waits for that; files are written whole, so none is lost
+            os._exit(INTERRUPTED)
         sys.exit(INTERRUPTED)
     except Exception as error:
         from studies.extensions import plugin_error
@@ -85,6 +90,11 @@ def main(arguments: list[str] | None = None) -> None:
             raise
         print(f"studies: {printable(reason)}", file=sys.stderr)
         sys.exit(2)
+
+
+def _is_compiling() -> bool:
+    """Whether threads still compile, which Python's own end would wait for."""
+    return any(thread.name.startswith(COMPILING) for thread in threading.enumerate())
 
 
 def _check_text(arguments: list[str]) -> None:

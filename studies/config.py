@@ -183,6 +183,9 @@ def _turn_cache(is_on: bool) -> None:
     reset_cache()  # what JAX has decided when it compiled first
 
 
+#: Begin of the names of threads that may still compile when a command is interrupted.
+COMPILING = "compiling"
+
 _limited: tuple[Lock, list[Any]] = Lock(), []  # threads in it, and at first the limit in force
 
 

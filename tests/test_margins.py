@@ -22,6 +22,7 @@ from jaxmodel.return_difference import (
 )
 from jaxmodel.sampled_loop import closed_loop
 from studies.engine import lanes
+from studies.engine.eigenvalues import eigenvalues
 from studies.engine.margins import LEAST_DAMPED, judge_loops
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.results import read_sweep
@@ -417,3 +418,19 @@ def test_cases_that_are_ok_have_stable_loops(tmp_path):
         np.testing.assert_allclose(data["gain_margin"][np.sort(rows)], wanted, rtol=0.02, atol=1e-2)
     best = ranked_cases(data, "residual_rms", "gain_margin >= 2", 10)
     assert np.all(data["gain_margin"][best] >= 2)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1e200, 1e-150])
+def test_eigenvalues_are_those_of_numpy_on_every_scale(factor):
+    matrix = factor * np.random.default_rng(0).normal(size=(7, 7))
+    found, wanted = (np.sort_complex(of(matrix)) for of in (eigenvalues, np.linalg.eigvals))
+    np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-13 * factor)
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [np.ones(3), np.ones((2, 3)), np.ones((2, 2, 2)), 1j * np.eye(2), np.full((2, 2), np.nan)],
+)
+def test_eigenvalues_refuse_what_is_no_real_matrix(matrix):
+    with pytest.raises(np.linalg.LinAlgError):
+        eigenvalues(matrix)

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure, with_ratio
 from jaxmodel.simulate import Result
+from studies.config import COMPILING
 from studies.engine.executor import Executor, own_ratios
 from studies.engine.margins import judge_loops, no_margins
 from studies.engine.plan import Chunk, Group, Layout, chunk_cases, local_layout
@@ -89,27 +90,31 @@ class LocalRunner:
         self, table: CaseTable, groups: list[Group], reporter: Reporter, stop: threading.Event
     ) -> Generator[Done | Lost]:
         waiting, begun = iter(groups), deque[Future[_BegunGroup]]()
-        with ThreadPoolExecutor(BEGUN) as pool:
+        pool, is_hurried = ThreadPoolExecutor(BEGUN, COMPILING), False
 
-            def begin_next() -> None:
-                group = next(waiting, None)
-                if group is not None and not stop.is_set():
-                    begun.append(pool.submit(_begin, table, group))
+        def begin_next() -> None:
+            group = next(waiting, None)
+            if group is not None and not stop.is_set():
+                begun.append(pool.submit(_begin, table, group))
 
-            try:
-                for _ in range(BEGUN):
-                    begin_next()
-                while begun:
-                    one = _waited_for(begun[0], reporter)
-                    begun.popleft()
-                    yield from _finish(table, one, reporter, stop)
-                    if stop.is_set():
-                        return
-                    begin_next()
-            finally:
-                for future in begun:
-                    if not future.cancel() and future.exception() is None:
-                        future.result().first.cancel()
+        try:
+            for _ in range(BEGUN):
+                begin_next()
+            while begun:
+                one = _waited_for(begun[0], reporter)
+                begun.popleft()
+                yield from _finish(table, one, reporter, stop)
+                if stop.is_set():
+                    return
+                begin_next()
+        except KeyboardInterrupt:
+            is_hurried = True  # a compiler cannot be stopped, and is not waited for
+            raise
+        finally:
+            pool.shutdown(wait=not is_hurried, cancel_futures=True)
+            for future in begun:
+                if future.done() and not future.cancelled() and future.exception() is None:
+                    future.result().first.cancel()
 
 
 class _BegunGroup(NamedTuple):

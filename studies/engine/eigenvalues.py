@@ -9,6 +9,10 @@ from typing import Any
 
 import numpy as np
 
+#: Matrices whose largest entry is below this, or above its inverse, are scaled first: the LAPACK of
+#: SciPy 1.17 takes them for smaller or larger than they are.
+SMALLEST = 1e-100
+
 _INT, _CHAR = ctypes.POINTER(ctypes.c_int), ctypes.c_char_p
 
 
@@ -22,15 +26,21 @@ def eigenvalues(matrix: np.ndarray) -> np.ndarray:
         Complex, (n,).
 
     Raises:
-        LinAlgError: an entry is not finite, or the algorithm does not converge.
+        LinAlgError: not a real square matrix, an entry is not finite, or the algorithm does not
+            converge.
 
     Example:
         >>> eigenvalues(np.array([[0.0, 1.0], [-4.0, 0.0]]))
         array([0.+2.j, 0.-2.j])
     """
+    matrix = np.asarray(matrix)
+    if matrix.ndim != 2 or len(matrix) != matrix.shape[1] or not np.isrealobj(matrix):
+        raise np.linalg.LinAlgError(f"{matrix.dtype} of {matrix.shape}: not a real square matrix")
     if not np.isfinite(matrix).all():
         raise np.linalg.LinAlgError("Array must not contain infs or NaNs")
-    n = len(matrix)
+    n, size = len(matrix), float(np.abs(matrix).max(initial=0.0))
+    if size and not SMALLEST < size < 1 / SMALLEST:
+        return size * eigenvalues(matrix / size)
     own = np.array(matrix, float, order="F")  # which is overwritten
     real, imaginary = np.empty(n), np.empty(n)
     fault = _dgeev(own, real, imaginary, np.empty(_work_size(n)))

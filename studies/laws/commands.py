@@ -51,9 +51,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         try:
             run_laws(study, out, voltage, margin, resume, console, quiet)
         except KeyboardInterrupt:
-            print(
-                f"studies: interrupted; finished work is safe; continue with --resume --out {out}",
-                file=sys.stderr,
-            )
-            sys.exit(130)
+            if out.exists():
+                text = f"studies: finished work is safe; continue with --resume --out {out}"
+                print(text, file=sys.stderr)
+            raise
         announce(console, out / REPORT)

@@ -19,6 +19,7 @@ from studies.laws.ranking import RESAMPLES, Ranking, geometric_mean, rank
 from studies.laws.tuning import Budget, Tuned
 from studies.publish import shown
 from studies.study.entries import controlled_links
+from studies.study.margin import ENOUGH, margin_text
 from studies.study.paths import set_values
 from studies.study.resolution import least_step, resolution_text
 from studies.study.spec import Study, parse_study
@@ -187,7 +188,7 @@ def verdict(findings: LawFindings) -> list[str]:
         "resamplings of the machines."
     ]
     others = [_other(findings, name) for name in list(FIGURES)[1:]]
-    beyond = beyond_budget(findings, row), _best_with_margin(findings)
+    beyond = beyond_budget(findings, row), _low_gain_margin(findings, row), _keeping(findings)
     every = [*_equals(findings), _own_law(findings), *others, *beyond]
     return [*filter(None, [_resolution(findings)]), *lines, *filter(None, every)]
 
@@ -237,7 +238,18 @@ def beyond_budget(findings: LawFindings, k: int) -> str:
     return f"On machines and moves that it was not tuned on: {', '.join(parts)}." if parts else ""
 
 
-def _best_with_margin(findings: LawFindings) -> str:
+def _low_gain_margin(findings: LawFindings, k: int) -> str:
+    """Warning of a gain margin that is low on any machine."""
+    least = float(np.nanmin(findings.judged.margins["gain_margin"][k]))
+    if least >= ENOUGH:
+        return ""
+    return (
+        f"Its gain margin is {margin_text(least, 3)} on the worst machine: below {ENOUGH:g}, loops "
+        "may go unstable on the real one."
+    )
+
+
+def _keeping(findings: LawFindings) -> str:
     """The best controller that keeps the disk margin on every machine, if the best one does not."""
     ranking, rows = findings.ranking, findings.competing
     margin = np.nanmin(findings.judged.margins["disk_margin"][rows], axis=1)

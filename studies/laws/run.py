@@ -187,13 +187,12 @@ def _tune(study: Study, out: Path, budget: Budget, phases: Phases) -> list[Tuned
         done.append(one)
         return one
 
-    with ThreadPoolExecutor(TOGETHER) as pool:
-        try:
-            return list(pool.map(tune, range(len(candidates))))
-        except BaseException:
-            stop.set()
-            phases.say("stopping after the iterations under way")
-            raise
+    pool = ThreadPoolExecutor(TOGETHER, config.COMPILING)
+    try:
+        return list(pool.map(tune, range(len(candidates))))
+    finally:
+        stop.set()
+        pool.shutdown(wait=False, cancel_futures=True)  # what an iteration kept is safe
 
 
 def _slug(name: str) -> str:

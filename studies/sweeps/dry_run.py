@@ -29,7 +29,7 @@ def print_plan(plan: Plan, console: Console) -> None:
         layout, structure = group.layout, group.structure
         console.print(
             f"program: {'linear model, ' if structure.is_linear else ''}law {structure.law}, "
-            f"{structure.basis}, "
+            f"drive {structure.drive}, {structure.basis}, "
             f"{count_text(structure.n_modes, 'mode')}, {structure.feedback} feedback, "
             f"{count_text(structure.n_steps, 'sample')} of "
             f"{count_text(structure.substeps, 'plant step')}: "
