@@ -44,14 +44,19 @@ def _solution() -> Callable[..., Array]:
         a, b, _, r = primals
         x = solve(*primals)
         _, change = jax.jvp(lambda *p: _right_hand_side(x, *p), primals, tangents)
-        loop = a - b @ jnp.linalg.solve(r + b.T @ x @ b, b.T @ x @ a)
+        loop = a - b @ _gain(x, a, b, r)
         return x, solve_stein(loop, change)
 
     return solve
 
 
 def _right_hand_side(x: Array, a: Array, b: Array, q: Array, r: Array) -> Array:
-    return a.T @ x @ (a - b @ jnp.linalg.solve(r + b.T @ x @ b, b.T @ x @ a)) + q
+    return a.T @ x @ (a - b @ _gain(x, a, b, r)) + q
+
+
+def _gain(x: Array, a: Array, b: Array, r: Array) -> Array:
+    """K of u = -K x, (m, n)."""
+    return jnp.linalg.solve(r + b.T @ x @ b, b.T @ x @ a)
 
 
 def _by_doubling(a: Array, b: Array, q: Array, r: Array) -> Array:
@@ -85,7 +90,7 @@ def solve_stein(z: Array, w: Array) -> Array:
 def regulator_gain(a: Array, b: Array, q: Array, r: Array) -> Array:
     """K of u = -K x that minimises the sum of x'Qx + u'Ru, (m, n); arguments: `solve_riccati`."""
     x = solve_riccati(a, b, q, r)
-    return jnp.linalg.solve(r + b.T @ x @ b, b.T @ x @ a)
+    return _gain(x, a, b, r)
 
 
 def filter_gain(a: Array, c: Array, q: Array, r: Array) -> Array:

@@ -21,7 +21,7 @@ from studies import __version__
 from studies.atlas.commands import add_commands as add_atlas
 from studies.bench.commands import add_commands as add_bench
 from studies.cache import KINDS, VARIABLE, Kept, cache_contents, is_shared
-from studies.config import COMPILING, PACKAGE, configure, keep_programs, start
+from studies.config import PACKAGE, configure, keep_programs, start
 from studies.errors import OWN_WARNINGS, StudyError, printable
 from studies.export.commands import add_commands as add_export
 from studies.fitting.commands import add_commands as add_fit
@@ -32,6 +32,7 @@ from studies.show.document import AsJson, print_document
 from studies.single.commands import add_commands as add_single
 from studies.spillover.commands import add_commands as add_spillover
 from studies.sweeps.commands import add_commands as add_sweeps
+from studies.threads import COMPILING
 from studies.tuning.commands import add_commands as add_tuning
 from studies.twin.commands import add_commands as add_twin
 from studies.verify.commands import add_commands as add_verify

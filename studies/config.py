@@ -11,14 +11,14 @@ import os
 import platform
 import re
 import warnings
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 from studies.cache import chosen_folder, exposure, is_usable
 from studies.errors import CacheWarning, StudyError, field_error, nearest
+from studies.threads import SharedSetting
 
 PACKAGE = "flexlink-studies"
 PRECISIONS = ("float64", "float32")
@@ -156,24 +156,9 @@ def is_keeping() -> bool:
     return _keeps_programs
 
 
-_without_cache = Lock(), [0]  # how many threads compile without JAX's cache
-
-
-@contextmanager
-def without_jax_cache() -> Iterator[None]:
-    """Compile anew: an executable from JAX's own cache lacks what it needs to be kept elsewhere."""
-    lock, count = _without_cache
-    with lock:
-        if not count[0]:
-            _turn_cache(False)
-        count[0] += 1
-    try:
-        yield
-    finally:
-        with lock:
-            count[0] -= 1
-            if not count[0]:
-                _turn_cache(_has_cache)
+def _leave_cache() -> Callable[[], None]:
+    _turn_cache(False)
+    return lambda: _turn_cache(_has_cache)
 
 
 def _turn_cache(is_on: bool) -> None:
@@ -183,31 +168,8 @@ def _turn_cache(is_on: bool) -> None:
     reset_cache()  # what JAX has decided when it compiled first
 
 
-#: Begin of the names of threads that may still compile when a command is interrupted.
-COMPILING = "compiling"
-
-_limited: tuple[Lock, list[Any]] = Lock(), []  # threads in it, and at first the limit in force
-
-
-@contextmanager
-def serial_blas() -> Iterator[None]:
-    """NumPy's matrix operations on one thread each: more only slow down many small matrices.
-
-    The limit is one of the process; it ends with the last thread inside.
-    """
-    from threadpoolctl import threadpool_limits
-
-    lock, inside = _limited
-    with lock:
-        inside.append(None if inside else threadpool_limits(1, "blas"))
-    try:
-        yield
-    finally:
-        with lock:
-            if len(inside) > 1:
-                inside.pop()
-            else:
-                inside.pop().restore_original_limits()
+#: Compile anew: an executable from JAX's own cache lacks what it needs to be kept elsewhere.
+without_jax_cache = SharedSetting(_leave_cache)
 
 
 def start(precision: str = "float64", gpu: bool = False) -> None:

@@ -34,7 +34,6 @@ from studies.atlas.subsets import (
     subset_label,
 )
 from studies.atlas.workspace import PAIRS
-from studies.config import serial_blas
 from studies.engine.columns import axis_variables
 from studies.engine.folder import ATLASES, locked_folder, refuse_existing
 from studies.engine.progress import Phases
@@ -47,6 +46,7 @@ from studies.show.sketch import sketch
 from studies.space.spec import SweepSpec
 from studies.store import Variable, axis_sizes, write_store
 from studies.study.spec import Study
+from studies.threads import serial_blas
 
 DATA, RUNS_FOLDER, MODES_FOLDER = "atlas.h5", ATLASES.mark, "runs_modes"
 #: Phases after those of the sweep.

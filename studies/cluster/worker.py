@@ -109,8 +109,7 @@ def run_chunk(job: ChunkJob) -> ChunkDone:
         is_first = executor.compile_time == 0
         size = even_layout(job.size).size
         cases = chunk_cases(table, job.rows, job.structure, size)
-        how = job.is_judged, job.robustness
-        started = start_chunk(executor, table, job.rows, cases, job.has_own_ratio, *how)
+        started = start_chunk(executor, table, job.rows, cases, job.is_judged, job.robustness)
         judged = started.wait()
         compile_time = executor.compile_time if is_first else 0.0
         return ChunkDone(judged, executor.name, compile_time, worker.address)

@@ -18,13 +18,13 @@ from jaxmodel.delay import LONGEST as LONGEST_DELAY
 from jaxmodel.delay import true_delay
 from jaxmodel.laws.srf import SRF
 from jaxmodel.parameters import Array
-from studies.config import serial_blas
 from studies.engine.controller import FixedController
 from studies.engine.host_loop import SampledLoop, name_motion
 from studies.engine.nearest import Loops, nearest_unstable
 from studies.engine.programs import kept_jit
 from studies.engine.stability import with_margin_modes
 from studies.errors import StudyError, field_error, nearest
+from studies.threads import serial_blas
 
 #: One unit of each kind of change: how far it may well be off on a machine as built, in the units
 #: of `MachineChange`; of relative changes the natural logarithm of the factor.

@@ -14,7 +14,6 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure, with_ratio
 from jaxmodel.simulate import Result
-from studies.config import COMPILING
 from studies.engine.executor import Executor, own_ratios
 from studies.engine.margins import judge_loops, no_margins
 from studies.engine.plan import Chunk, Group, Layout, chunk_cases, local_layout
@@ -24,6 +23,7 @@ from studies.engine.stability import LoopFigures
 from studies.kernels.compilation import compiler_time
 from studies.space.table import CaseTable
 from studies.study.cases import signed_power
+from studies.threads import COMPILING
 
 
 class Done(NamedTuple):
@@ -76,7 +76,7 @@ class Runner(Protocol):
         ...
 
 
-#: Groups that are begun side by side: a compiler keeps about one core busy.
+#: Groups that are begun side by side: neither compilers nor runs keep all cores busy all the time.
 BEGUN = 2
 
 
@@ -132,8 +132,7 @@ def _begin(table: CaseTable, group: Group) -> _BegunGroup:
 
 def _start(table: CaseTable, group: Group, executor: Executor, chunk: Chunk) -> Started:
     cases = chunk_cases(table, chunk.rows, group.structure, group.layout.size)
-    own = has_own_ratio(table, group)
-    return start_chunk(executor, table, chunk.rows, cases, own, group.is_judged, group.robustness)
+    return start_chunk(executor, table, chunk.rows, cases, group.is_judged, group.robustness)
 
 
 def _waited_for(begun: Future[_BegunGroup], reporter: Reporter) -> _BegunGroup:
@@ -180,7 +179,6 @@ def start_chunk(
     table: CaseTable,
     rows: np.ndarray,
     cases: Case,
-    has_own_ratio: bool,
     is_judged: bool = True,
     robustness: tuple[str, ...] = (),
 ) -> Started:
@@ -193,12 +191,11 @@ def start_chunk(
         table: all cases.
         rows: those of the chunk.
         cases: from `chunk_cases`.
-        has_own_ratio: whether such a pass is needed.
         is_judged: whether the loops are judged; otherwise their margins are NaN.
         robustness: figures of `jaxmodel.robustness` to judge them by as well.
     """
     is_first = executor.compile_time == 0
-    if has_own_ratio:
+    if executor.has_own_ratio:
         size = max(map(len, jax.tree.leaves(cases)))
         filled = np.concatenate([rows, np.full(size - len(rows), rows[-1])])
         is_own = table.values("control.ratio_source")[filled] == "own_run"

@@ -76,7 +76,7 @@ class Executor:
         """
         drop_programs()
         self.structure, self.layout, self.place = structure, layout, place
-        self._has_own_ratio = has_own_ratio
+        self.has_own_ratio = has_own_ratio
         self._kind, self._reason = kind or stepper(structure), ""
         self._function: BlockFunction | None = None
         self._pool = ThreadPoolExecutor(layout.devices)
@@ -156,7 +156,7 @@ class Executor:
 
     def _with_own_ratio(self, cases: Any) -> Any:
         """The same program for both passes, which differ in ratios and links."""
-        if not self._has_own_ratio:
+        if not self.has_own_ratio:
             return cases
         shape = (self.layout.size, 3, self.structure.n_controlled)
         cases = with_ratio(cases, np.broadcast_to(cases.control.ratio, shape))

@@ -41,12 +41,13 @@ from jaxmodel.return_difference import (
     loop_strength,
 )
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
-from studies.config import hosts, serial_blas
+from studies.config import hosts
 from studies.engine.damping import damping_ratios, least_controlled
 from studies.engine.lanes import BLOCK, run_steps
 from studies.engine.programs import kept_jit
 from studies.engine.stability import LoopFigures, loop_report, modes_alone, with_margin_modes
 from studies.study.margin import HIGHEST, LOWEST
+from studies.threads import serial_blas
 
 
 class FrequencySweep(NamedTuple):

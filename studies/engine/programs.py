@@ -17,7 +17,6 @@ import os
 import pickle
 from collections import defaultdict
 from collections.abc import Callable
-from contextlib import suppress
 from functools import cache, cached_property, update_wrapper
 from hashlib import sha256
 from pathlib import Path
@@ -45,14 +44,11 @@ MOST_MAPPINGS = 20_000
 _PROGRAMS: dict[str, Any] = {}
 
 
-#: Compiler options from the quickest to compile: with the first it takes a fifth of XLA's default
-#: time, with the second half of it, for about the same run time. Not for every program: a scan over
-#: time runs seven times slower, and a derivative with many shared terms can take minutes to
-#: compile. jaxlib 0.11 does not know the first.
-_QUICK: tuple[dict[str, Any], ...] = (
-    {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False},
-    {"xla_backend_optimization_level": 0},
-)
+#: Compiler options with which XLA takes half of its default time, and with the further one a fifth,
+#: for about the same run time. Not for every program: a scan over time runs seven times slower, and
+#: a derivative with many shared terms can take minutes to compile. jaxlib 0.11 lacks the second.
+_QUICK: dict[str, Any] = {"xla_backend_optimization_level": 0}
+_QUICKER = _QUICK | {"xla_cpu_use_fusion_emitters": False}
 
 
 @cache
@@ -60,11 +56,11 @@ def quick_options() -> dict[str, Any]:
     """Compiler options for programs on this machine's cores that are used for a few cases."""
     with on_host():
         lowered = jax.jit(lambda: 0).lower()
-        for options in _QUICK[:-1]:
-            with suppress(RuntimeError, ValueError):  # an option that this jaxlib does not know
-                lowered.compile(compiler_options=options)
-                return options
-    return _QUICK[-1]
+    try:
+        lowered.compile(compiler_options=_QUICKER)
+    except (RuntimeError, ValueError):  # an option that this jaxlib does not know
+        return _QUICK
+    return _QUICKER
 
 
 class KeptFunction:

@@ -24,7 +24,7 @@ from jaxmodel.prepare import prepare
 from jaxmodel.return_difference import assembled_modes
 from jaxmodel.robustness import MarginPlace, norm_peaks
 from jaxmodel.sampled_loop import DelayedParts, delayed_parts
-from studies.config import hosts, serial_blas
+from studies.config import hosts
 from studies.engine.crossings import delay_margins, phase_margins
 from studies.engine.delay_check import DelayedLoops, checked_delays
 from studies.engine.disk_margin import LARGEST, disk_margins
@@ -33,6 +33,7 @@ from studies.engine.margin_grid import GridGain, search_grid
 from studies.engine.plan import padded_rows
 from studies.engine.programs import kept_jit
 from studies.engine.stability import modes_alone, with_margin_modes
+from studies.threads import serial_blas
 
 #: Loops per call; each core takes one call after another.
 BATCH = 8

@@ -25,10 +25,10 @@ from jaxmodel.motion import PathSample, end_of_path, sample_path
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, loop_matrices
-from studies.config import serial_blas
 from studies.engine.host_loop import SampledLoop, name_motion, sampled_loop
 from studies.engine.programs import kept_jit
 from studies.study.margin import HIGHEST, LOWEST, MARGIN_MODES
+from studies.threads import serial_blas
 
 #: Largest ratio of successive gain factors [1].
 STRIDE = 1.25

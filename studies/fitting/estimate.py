@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from rich.console import Console
 
-from studies.config import serial_blas
 from studies.engine.preflight import check_run
 from studies.engine.progress import Phases
 from studies.errors import StudyError
@@ -24,6 +23,7 @@ from studies.fitting.statistics import Answer, Misfit, misfit, rivals
 from studies.publish import shown
 from studies.study.paths import set_values
 from studies.study.spec import Study, parse_study
+from studies.threads import serial_blas
 
 #: Parameters up to which all likelihoods are profiled.
 PROFILED = 6

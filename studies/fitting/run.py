@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from studies.config import serial_blas
 from studies.engine.folder import FIT
 from studies.engine.progress import Phases
 from studies.engine.run_data import run_attributes
@@ -24,6 +23,7 @@ from studies.show import figures
 from studies.show.document import json_text
 from studies.store import Variable, write_store
 from studies.study.template import study_template
+from studies.threads import serial_blas
 
 #: Least gain margin of that tuning [1].
 MARGIN = 2.0

@@ -240,7 +240,7 @@ def beyond_budget(findings: LawFindings, k: int) -> str:
 
 def _low_gain_margin(findings: LawFindings, k: int) -> str:
     """Warning of a gain margin that is low on any machine."""
-    least = float(np.nanmin(findings.judged.margins["gain_margin"][k]))
+    least = float(np.nanmin(findings.judged.margins["gain_margin"][k], initial=np.inf))
     if least >= ENOUGH:
         return ""
     return (
@@ -252,7 +252,7 @@ def _low_gain_margin(findings: LawFindings, k: int) -> str:
 def _keeping(findings: LawFindings) -> str:
     """The best controller that keeps the disk margin on every machine, if the best one does not."""
     ranking, rows = findings.ranking, findings.competing
-    margin = np.nanmin(findings.judged.margins["disk_margin"][rows], axis=1)
+    margin = np.nan_to_num(findings.judged.margins["disk_margin"][rows]).min(axis=1)
     keeps = np.isfinite(ranking.ratio) & (TOLERANCE * margin >= findings.budget.margin)
     if keeps[ranking.best]:
         return ""

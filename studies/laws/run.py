@@ -43,11 +43,12 @@ from studies.space.spec import SweepSpec
 from studies.study.spec import Study
 from studies.study.template import study_template
 from studies.study.window import with_window
+from studies.threads import COMPILING
 
 DOCUMENT, TUNING, RUNS = "laws.json", "tuning", "runs"
 #: Machines to judge on.
 MACHINES = 16
-#: Candidates that are tuned side by side: a compiler keeps about one core busy.
+#: Candidates tuned side by side: neither compilers nor runs keep all cores busy all the time.
 TOGETHER = 2
 
 
@@ -187,7 +188,7 @@ def _tune(study: Study, out: Path, budget: Budget, phases: Phases) -> list[Tuned
         done.append(one)
         return one
 
-    pool = ThreadPoolExecutor(TOGETHER, config.COMPILING)
+    pool = ThreadPoolExecutor(TOGETHER, COMPILING)
     try:
         return list(pool.map(tune, range(len(candidates))))
     finally:

@@ -9,7 +9,6 @@ import numpy as np
 from jaxmodel.beam import BASES
 from jaxmodel.controller import linear_parts
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
-from studies.config import serial_blas
 from studies.engine.breaking import BreakingChange
 from studies.engine.controller import FixedController, fixed_controller
 from studies.engine.host_loop import SampledLoop, name_motion
@@ -30,6 +29,7 @@ from studies.spillover.proofs import Proofs
 from studies.study.consistency import each_link
 from studies.study.margin import hysteresis_text
 from studies.study.spec import Study
+from studies.threads import serial_blas
 
 #: Gain factors at which modes are traced from no control to the design's gains.
 STEPS = np.linspace(0, 1, 17)[1:]

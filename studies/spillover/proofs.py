@@ -19,7 +19,6 @@ from jaxmodel.drives import DRIVES
 from jaxmodel.modal_loop import ModalLoop, modal_loop
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, delayed_loop
 from jaxmodel.zero_exclusion import prepare_exclusion
-from studies.config import serial_blas
 from studies.engine.controller import FixedController
 from studies.engine.eigenvalues import eigenvalues
 from studies.engine.programs import kept_jit
@@ -32,6 +31,7 @@ from studies.spillover.plants import (
     plant_structure,
 )
 from studies.study.margin import margin_text
+from studies.threads import serial_blas
 
 #: Basis whose modes beyond the known ones are bounded in closed form.
 SINES = "pinned_pinned"

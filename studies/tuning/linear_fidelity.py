@@ -18,12 +18,12 @@ import numpy as np
 from jaxmodel.case import Structure
 from jaxmodel.loop_figures import MARGINS, PEAKS
 from jaxmodel.parameters import Array
-from studies.config import serial_blas
 from studies.engine.plan import padded_rows
 from studies.engine.robustness import find_margins
 from studies.errors import StudyError
 from studies.study.cases import in_working_precision
 from studies.study.numbers import Numbers, stack_numbers, study_numbers
+from studies.threads import serial_blas
 from studies.tuning.loop_figures import (
     allowed_on,
     figures_of_cases,

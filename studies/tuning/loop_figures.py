@@ -21,7 +21,6 @@ from jaxmodel.loop_figures import MARGINS, PEAKS
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopMatrices, closed_loop, spillover
-from studies.config import serial_blas
 from studies.engine.columns import ON_DEMAND
 from studies.engine.eigenvalues import eigenvalues
 from studies.engine.programs import kept_jit
@@ -32,6 +31,7 @@ from studies.study.fields import Columns
 from studies.study.margin import MARGIN_MODES
 from studies.study.paths import parts_of
 from studies.study.spec import Study
+from studies.threads import serial_blas
 from studies.tuning.spec import BASELINE, LOWER, TuneSpec
 
 #: Points of each straight move at which its distance from singularities is evaluated.
