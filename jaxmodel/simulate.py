@@ -174,6 +174,7 @@ def _points(x: Array, n: int) -> Array:
 
 def _windows(structure: Structure, case: Case, time: Array, end: Array) -> metrics.Window:
     windows, tick = case.windows, case.electronics.period / 2  # half a sample against rounding
+    after = time - end
     begin = end + windows.residual_delay
     is_residual = (time > begin - tick) & (time < begin + windows.residual_length - tick)
     taper = np.sin(np.pi * np.arange(structure.n_steps) / structure.n_steps) ** 2
@@ -181,7 +182,7 @@ def _windows(structure: Structure, case: Case, time: Array, end: Array) -> metri
         time=time,
         is_moving=(time < end - tick).astype(time.dtype),
         is_residual=is_residual.astype(time.dtype),
-        after_command=jnp.maximum(time - end, 0.0),
+        after_command=jnp.where(after > 1e-6 * tick, after, 0.0),
         taper=jnp.asarray(taper, time.dtype),
     )
 

@@ -253,3 +253,4 @@ def test_windows_have_whole_numbers_of_samples(first):
         after = np.asarray(window.after_command)
         wanted = np.maximum(period * np.arange(-first, structure.n_steps - first), 0)
         np.testing.assert_allclose(after, wanted, atol=1e-9)
+        assert np.count_nonzero(after) == len(after) - first - 1  # no rounding error as a time

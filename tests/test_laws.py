@@ -19,12 +19,22 @@ from studies.laws.findings import beyond_budget
 from studies.laws.judging import MOVES, breaking_text, changes, judging_sweep, longer
 from studies.laws.machines import machines_of, spread_of, with_noise
 from studies.laws.ranking import rank
-from studies.laws.tuning import Budget, Tuned, make_budget, tune_candidate, tuning_of
+from studies.laws.tuning import (
+    Budget,
+    Quality,
+    Tuned,
+    _quality,
+    make_budget,
+    tune_candidate,
+    tuning_of,
+)
 from studies.show.document import schema
 from studies.space.table import build_table
 from studies.study.cases import build_cases, build_structure
 from studies.study.spec import paper_study, parse_study
 from studies.study.window import with_window
+from studies.tuning.optimise import _fresh_progress
+from tests.pages import tables_of
 
 STUDY = with_window(paper_study().change(link__modes=4, run__duration=0.12, motion__move_time=0.05))
 STUDY = STUDY.change(
@@ -157,6 +167,30 @@ def test_a_damaged_tuning_is_not_a_law_that_fails(tmp_path):
         tune_candidate(STUDY, law_candidates(STUDY)[0], Budget(50.0, 0.4), file, print)
 
 
+def test_what_says_how_far_a_tuning_has_come():
+    spec = tuning_of(STUDY, law_candidates(STUDY)[0], Budget(50.0, 0.4, starts=3, iterations=8))
+    p = len(spec.free.numbers)
+    at = _fresh_progress(spec, np.full((3, p), 0.5))
+    place = np.full((3, p), 0.5)
+    place[0, -1] = 1.0
+    objective = np.full((8, 3), 0.9)
+    objective[2], objective[7] = 0.625, (0.5, 0.52, 0.55)
+    violation = np.zeros_like(objective)
+    objective[6], violation[6] = 0.1, 0.5  # does not count
+    at = at._replace(
+        iteration=np.array(8),
+        best_place=place,
+        best_objective=np.array([0.5, 0.52, 0.55]),
+        best_limits=np.full_like(at.best_limits, -0.1),
+        history=np.stack([objective, violation], axis=-1),
+    )
+    wanted = Quality(0.5, 2, 0.2, (spec.free.numbers[-1].name,))
+    found = _quality(spec, at)
+    assert found._replace(late_gain=round(found.late_gain, 12)) == wanted
+    unkept = at._replace(history=np.stack([objective, violation + 1], axis=-1))
+    assert np.isnan(_quality(spec, unkept).late_gain)
+
+
 def test_changes_rebuild_a_design():
     other = STUDY.change(
         control__law="lqg", control__laws={"lqg": {"voltage_weight": 1e-7}}, drive__kd=50.0
@@ -202,7 +236,7 @@ def test_budget_from_the_command_line():
 
 
 def tuned(candidate, study):
-    return Tuned(candidate, study, "", 1)
+    return Tuned(candidate, study, "", 1, Quality(0.7, 3, np.nan, ("drive.kp",)))
 
 
 def test_a_comparison_writes_a_page_whose_order_is_that_of_the_runs(tmp_path, monkeypatch):
@@ -224,7 +258,19 @@ def test_a_comparison_writes_a_page_whose_order_is_that_of_the_runs(tmp_path, mo
     wanted = np.exp(np.log(own[2] / own[3]).mean())  # weak over strong, by the definition
     weak = next(x for x in document["controllers"] if x["name"] == "weak + PD")
     assert weak["ratio"]["residual_rms"][0] == pytest.approx(wanted)
-    assert "strong + PD" in (tmp_path / "out" / "report.html").read_text()
+    page = (tmp_path / "out" / "report.html").read_text()
+    (table,) = tables_of(page)["Their tunings"]
+    row = [cells[table["candidate"].index("PD")] for cells in table.values()]
+    assert row == ["PD", "1", "0.700", "3 of 4", "-", "drive.kp"]
+    assert document["tunings"][2] == {
+        "name": "PD",
+        "numbers_tuned": 1,
+        "objective": 0.7,
+        "n_alike": 3,
+        "late_gain": None,
+        "at_bound": ["drive.kp"],
+    }
+    assert "strong + PD" in page
     strong = document["controllers"][0]
     alone = run_study(findings.controllers[3].study, False, has_margins=True).loop.robustness
     # of three machines within a few percent of the nominal one

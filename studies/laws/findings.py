@@ -49,7 +49,7 @@ class LawFindings(NamedTuple):
     budget: Budget
     controllers: list[Combination]  # those that ran, in the order of `judged`
     products: list[int | None]  # multiplications a sample of each; None without control
-    failed: list[Tuned]  # those of which no design came
+    tuned: list[Tuned]  # all candidates
     judged: Judged
     rankings: dict[str, Ranking]  # by metric of FIGURES, of the controllers in the competition
 
@@ -60,6 +60,11 @@ class LawFindings(NamedTuple):
     def competing(self) -> list[int]:
         """Controllers that keep the budget."""
         return [k for k, one in enumerate(self.controllers) if not one.reason]
+
+    @property
+    def failed(self) -> list[Tuned]:
+        """Candidates of which no controller came."""
+        return [x for x in self.tuned if x.study is None]
 
     @property
     def ranking(self) -> Ranking:
@@ -99,7 +104,7 @@ def find(
             for entry, margin in zip(entries, judged.margins["gain_margin"], strict=True)
         ],
         products=[products[_controller(entry)] for entry in entries],
-        failed=[x for x in tuned if x.study is None],
+        tuned=tuned,
         judged=judged,
         rankings={},
     )

@@ -12,6 +12,7 @@ from studies.laws.findings import LawFindings, beyond_budget, verdict
 from studies.laws.judging import FIGURES, MOVES, longer
 from studies.laws.machines import spread_of
 from studies.laws.ranking import CONFIDENCE, geometric_mean
+from studies.laws.tuning import AGREE, LATE, Tuned
 from studies.show.document import json_text
 from studies.show.pages import page
 from studies.show.sketch import CAPTION
@@ -51,6 +52,14 @@ LOOP_HEADS = (
     "multiplications per sample",
     "tuned parameters",
 )
+TUNING_HEADS = (
+    "candidate",
+    "tuned parameters",
+    "objective over the given design's",
+    f"starting points within {100 * AGREE:.0f} % of the best",
+    f"gain of the last {LATE} iterations",
+    "at a bound",
+)
 
 
 def report(findings: LawFindings, images: Path | None = None) -> str:
@@ -73,6 +82,8 @@ def report(findings: LawFindings, images: Path | None = None) -> str:
         rows=table_rows(findings),
         loop_heads=LOOP_HEADS,
         loop_rows=[_loop_row(findings, k) for k in _order(findings)],
+        tuning_heads=TUNING_HEADS,
+        tuning_rows=[_tuning_row(findings, x) for x in findings.tuned],
         failed=findings.failed,
         machines=machines,
         moves=moves,
@@ -135,6 +146,20 @@ def _loop_row(findings: LawFindings, k: int) -> list[str]:
     ]
 
 
+def _tuning_row(findings: LawFindings, one: Tuned) -> list[str]:
+    """What says how far a candidate's tuning has come."""
+    cells = ["-"] * 4
+    if one.quality is not None:
+        objective, n_alike, gain, at_bound = one.quality
+        cells = [
+            f"{objective:.3f}",
+            f"{n_alike} of {findings.budget.starts}",
+            "-" if np.isnan(gain) else f"{100 * gain:.1f} %",
+            ", ".join(at_bound) or "-",
+        ]
+    return [one.candidate.name, str(one.n_free), *cells]
+
+
 def _worst_margins(findings: LawFindings, k: int) -> dict[str, float]:
     """Least margins of a controller on the machines it was judged on."""
     return {name: _over(findings.judged.margins[name][k], np.min) for name in SHOWN_MARGINS}
@@ -174,10 +199,16 @@ def document(findings: LawFindings) -> str:
         "budget": findings.budget._asdict(),
         "verdict": verdict(findings),
         "controllers": [_entry(findings, k) for k in _order(findings)],
+        "tunings": [_tuning_entry(x) for x in findings.tuned if x.quality is not None],
         "failed": [{"name": x.candidate.name, "reason": x.reason} for x in findings.failed],
         "study": findings.study.model_dump(mode="json"),
     }
     return json_text("laws", whole)
+
+
+def _tuning_entry(one: Tuned) -> dict[str, Any]:
+    assert one.quality is not None
+    return {"name": one.candidate.name, "numbers_tuned": one.n_free, **one.quality._asdict()}
 
 
 def _entry(findings: LawFindings, k: int) -> dict[str, Any]:

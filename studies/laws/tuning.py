@@ -27,6 +27,10 @@ from studies.tuning.spec import TuneSpec, parse_tuning
 
 #: The limit on the loop.
 MARGIN = "disk_margin"
+#: Share of the best objective within which starting points count as agreeing.
+AGREE = 0.05
+#: The last iterations, of which the gain says whether a tuning has ended.
+LATE = 5
 
 
 class Budget(NamedTuple):
@@ -68,6 +72,15 @@ def make_budget(study: Study, voltage: float | None, margin: float) -> Budget:
     return Budget(float(voltage), margin)
 
 
+class Quality(NamedTuple):
+    """What says whether a tuning found the best numbers."""
+
+    objective: float  # over that of the design as given, on the machines of the tuning [1]
+    n_alike: int  # starting points that end within AGREE of the best one, itself included
+    late_gain: float  # share by which LATE iterations improved the best one [1]; nan if unknown
+    at_bound: tuple[str, ...]  # numbers that end at one of their bounds
+
+
 class Tuned(NamedTuple):
     """A candidate after its tuning."""
 
@@ -75,6 +88,7 @@ class Tuned(NamedTuple):
     study: Study | None  # with its best numbers; None: no run of it finished
     reason: str  # why there is none, or which limit it does not keep; "" if all is well
     n_free: int  # numbers it was tuned by
+    quality: Quality | None = None  # None: no run of it finished
 
 
 def tuning_of(study: Study, candidate: Contender, budget: Budget) -> TuneSpec:
@@ -139,7 +153,22 @@ def tune_candidate(
     if not np.isfinite(at.best_objective[best]):
         return Tuned(candidate, None, "no start finished a run", count)
     tuned = tuned_study(spec, family, spec.free.values(at.best_place[best]))
-    return Tuned(candidate, tuned, _violated(spec, at, best), count)
+    return Tuned(candidate, tuned, _violated(spec, at, best), count, _quality(spec, at))
+
+
+def _quality(spec: TuneSpec, at: Progress) -> Quality:
+    best = at.winner(0)
+    least = np.fmin.reduce(at.least_so_far(), axis=1)
+    before = least[max(len(least) - 1 - LATE, 0)]
+    ends = np.isin(at.best_place[best], (0.0, 1.0)) & spec.moving[0].is_free
+    return Quality(
+        objective=float(at.best_objective[best]),
+        n_alike=len(at.alike(0, AGREE)),
+        late_gain=float(1 - least[-1] / before),
+        at_bound=tuple(
+            free.name for free, is_end in zip(spec.free.numbers, ends, strict=True) if is_end
+        ),
+    )
 
 
 def _optimised(

@@ -63,6 +63,18 @@ class Progress(NamedTuple):
         """How far a start's best design exceeds its limits, beyond what counts as kept."""
         return float(excess(self.best_limits[[start]])[0])
 
+    def alike(self, family: int, share: float) -> np.ndarray:
+        """Starts of a family that end within a share of its best one's objective."""
+        best = self.winner(family)
+        is_near = self.best_objective <= (1 + share) * self.best_objective[best]
+        is_kept = excess(self.best_limits) <= self.beyond(best)
+        return np.flatnonzero((self.family == family) & is_near & is_kept)
+
+    def least_so_far(self) -> np.ndarray:
+        """Objective of each start's best trial that keeps the limits, by iterations, (n, B)."""
+        done = self.history[: int(self.iteration)]
+        return np.fmin.accumulate(np.where(done[..., 1] <= KEPT, done[..., 0], np.nan))
+
 
 def excess(limits: np.ndarray) -> np.ndarray:
     """Largest violation beyond what counts as kept, (B,)."""

@@ -8,7 +8,7 @@ from matplotlib.ticker import MaxNLocator
 
 from jaxmodel.metrics import METRICS
 from studies.show import figures
-from studies.tuning.optimise import KEPT, excess
+from studies.tuning.optimise import excess
 from studies.tuning.report import TuneFindings, is_kept
 from studies.tuning.scenarios import move_label
 from studies.tuning.spec import TuneSpec
@@ -24,8 +24,7 @@ def descent(spec: TuneSpec, findings: TuneFindings) -> Figure:
     """
     with figures.styled():
         figure, ax = figures.one_panel(3.6)
-        history = findings.at.history[: int(findings.at.iteration)]
-        best = np.fmin.accumulate(np.where(history[..., 1] <= KEPT, history[..., 0], np.nan))
+        best = findings.at.least_so_far()
         iteration = np.arange(1, len(best) + 1)
         for k, family in enumerate(spec.moving):
             members = best[:, findings.at.family == k]

@@ -431,7 +431,7 @@ def _numbers(spec: TuneSpec, findings: TuneFindings) -> list[list[str]]:
     """Row of each free parameter but those of the placement, which `_centers` shows in mm."""
     at, families, rows = findings.at, spec.moving, []
     places = [at.best_place[at.winner(k)] for k in range(len(families))]
-    alike = [at.best_place[_equivalent_starts(at, k)] for k in range(len(families))]
+    alike = [at.best_place[at.alike(k, ALIKE)] for k in range(len(families))]
     for n, free in enumerate(spec.free.numbers):
         if free.key == PLACEMENT:
             continue
@@ -459,14 +459,6 @@ def _centers(spec: TuneSpec, findings: TuneFindings) -> list[list[str]]:
         centers = 1e3 * patch_centers(spec, family, values)
         rows.append([name, *(", ".join(f"{x:.1f}" for x in row) for row in centers)])
     return rows
-
-
-def _equivalent_starts(at: Progress, family: int) -> np.ndarray:
-    """Starts of a family that end about as well as its best one."""
-    best = at.winner(family)
-    is_near = at.best_objective <= (1 + ALIKE) * at.best_objective[best]
-    is_kept = excess(at.best_limits) <= at.beyond(best)
-    return np.flatnonzero((at.family == family) & is_near & is_kept)
 
 
 def is_kept(spec: TuneSpec, search: RandomSearch) -> np.ndarray:
