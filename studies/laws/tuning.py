@@ -153,7 +153,13 @@ def tune_candidate(
     if not np.isfinite(at.best_objective[best]):
         return Tuned(candidate, None, "no start finished a run", count)
     tuned = tuned_study(spec, family, spec.free.values(at.best_place[best]))
-    return Tuned(candidate, tuned, _violated(spec, at, best), count, _quality(spec, at))
+    return Tuned(
+        candidate=candidate,
+        study=tuned,
+        reason=_violated(spec, at, best),
+        n_free=count,
+        quality=_quality(spec, at),
+    )
 
 
 def _quality(spec: TuneSpec, at: Progress) -> Quality:
