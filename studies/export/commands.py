@@ -35,6 +35,13 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         dac_bits: Annotated[
             int | None, typer.Option(help="DAC resolution [bit], for c-fixed; default: 12")
         ] = None,
+        pil: Annotated[
+            str | None,
+            typer.Option(
+                help="emulated processor that runs the code, too: cortex-m3, cortex-m4, "
+                "cortex-m4f or cortex-m7; with a project to build for it"
+            ),
+        ] = None,
     ) -> None:
         """Export the controller of a design to a real-time target, and verify it."""
         from studies.publish import check_folder
@@ -45,7 +52,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.export.run import export_design
 
         chosen = load_design(design, case)
-        if not export_design(chosen, target, out, verify, name, dac_bits, console).is_good:
+        if not export_design(chosen, target, out, verify, name, dac_bits, console, pil).is_good:
             sys.exit(1)
 
     @app.command("import-gains")

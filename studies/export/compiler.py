@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -23,6 +23,13 @@ STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 _NAMES = ("cc", "gcc", "clang")
 _ALLOWED = "allowed: a C99 compiler for this machine, named by the variable CC"
 NO_COMPILER = "no C compiler found (the command in the variable CC if it is set, or cc, gcc, clang)"
+
+
+class Responding(Protocol):
+    """Code of a controller, wherever it runs."""
+
+    def respond(self, sensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A sequence (T, 3, K) from rest: actuator values (T, 3, K) and faults (T,)."""
 
 
 class Code(NamedTuple):

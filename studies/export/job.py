@@ -16,6 +16,8 @@ from studies.engine.controller import FixedController
 from studies.engine.stability import LoopFigures, loop_report
 from studies.errors import StudyError, field_error
 from studies.export.cost import Cost
+from studies.export.firmware.boards import Board
+from studies.export.firmware.on_target import OnTarget
 from studies.export.fixed import FixedPoint, rail_samples
 from studies.export.fixed_blocks import FixedBlocks
 from studies.export.in_the_loop import LoopRun
@@ -34,6 +36,7 @@ class Job(NamedTuple):
     is_verified: bool
     dac_bits: int
     console: Console
+    board: Board | None  # processor on which the code is to be emulated
 
 
 class ExportResult(NamedTuple):
@@ -44,6 +47,7 @@ class ExportResult(NamedTuple):
     verified: Verification | None
     fixed: FixedPoint | FixedBlocks | None = None
     cost: Cost | None = None
+    on_target: OnTarget | None = None
 
 
 def check_loop(

@@ -8,11 +8,13 @@ import numpy as np
 from markupsafe import Markup
 
 from studies.engine.controller import FixedController
-from studies.engine.stability import LoopFigures
 from studies.export.c_fixed import format_lines
-from studies.export.cost import Cost
+from studies.export.firmware.boards import CLOCKS
+from studies.export.firmware.on_target import OnTarget
+from studies.export.firmware.project import STACK
 from studies.export.fixed import MARGIN, FixedPoint
 from studies.export.fixed_blocks import FixedBlocks
+from studies.export.job import ExportResult
 from studies.export.verify import AIM, Verification
 from studies.show.pages import page
 from studies.study.margin import caution
@@ -21,24 +23,17 @@ from studies.study.margin import caution
 FAULT = Markup("<b>FAILED</b>")
 
 
-def report(
-    exported: FixedController,
-    origin: list[str],
-    loop: LoopFigures,
-    verified: Verification,
-    fixed: FixedPoint | FixedBlocks | None = None,
-    cost: Cost | None = None,
-) -> str:
-    """The page of an export.
+def report(exported: FixedController, origin: list[str], result: ExportResult) -> str:
+    """The page of an export that was verified.
 
     Args:
         exported: the controller.
         origin: lines that say where it came from.
-        loop: linearised sampled loop with the exported coefficients.
-        verified: what was compared.
-        fixed, cost: formats and cost in fixed point.
+        result: what was made and compared.
     """
-    controller = exported.controller
+    controller, verified = exported.controller, result.verified
+    assert verified is not None
+    loop, fixed = result.loop, result.fixed
     code = float(controller.adc_step / controller.adc_gain)
     return page(
         "export/report.html",
@@ -59,7 +54,9 @@ def report(
         code=code,
         deflection=code * np.abs(controller.feedback.filter[:, :1]).max(initial=0.0),
         fixed=fixed,
-        cost=cost,
+        cost=result.cost,
+        target=result.on_target,
+        **(_of_target(exported, result.on_target) if result.on_target is not None else {}),
         **(_of_fixed(exported, fixed, verified) if fixed is not None else {}),
     )
 
@@ -89,6 +86,23 @@ def _controllers(exported: FixedController, verified: Verification) -> list[list
             ]
         )
     return rows
+
+
+def _of_target(exported: FixedController, target: OnTarget) -> dict[str, Any]:
+    """What the section on the processor needs."""
+    rows = [
+        [name, str(len(x)), str(x.min()), f"{np.median(x):.0f}", str(x.max())]
+        for name, x in target.instructions.items()
+    ]
+    if not rows:
+        return {"instruction_rows": [], "reserved": STACK}
+    worst = target.instructions[target.costliest].max()
+    rate = exported.study.electronics.sample_rate_hz
+    loads = [
+        [f"{clock / 1e6:g} MHz", f"{100 * target.board.load(worst, rate, clock):.0f} %"]
+        for clock in CLOCKS
+    ]
+    return {"instruction_rows": rows, "worst": worst, "loads": loads, "reserved": STACK}
 
 
 def _of_fixed(

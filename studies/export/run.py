@@ -14,6 +14,8 @@ from studies.engine.design import Design
 from studies.errors import StudyError, field_error, nearest
 from studies.export.compiler import NO_COMPILER, find_compiler
 from studies.export.document import study_hash
+from studies.export.firmware.boards import BOARDS
+from studies.export.firmware.build import check_tools
 from studies.export.job import Job
 from studies.export.report import report
 from studies.export.targets import TARGETS
@@ -51,6 +53,7 @@ def export_design(
     name: str = "flexlink",
     dac_bits: int | None = None,
     console: Console | None = None,
+    pil: str | None = None,
 ) -> Exported:
     """Write a controller, verified if requested.
 
@@ -62,6 +65,8 @@ def export_design(
         name: of the files, prefix of C functions.
         dac_bits: resolution of the DAC, for targets that have one; None: `DAC_BITS`.
         console: where messages go; default: standard output.
+        pil: processor on which the code is emulated and for which a project is written, one of
+            `studies.export.firmware.boards.BOARDS`; None: neither.
 
     Returns:
         what was written and compared; `is_good`: whether everything agreed.
@@ -70,6 +75,8 @@ def export_design(
         StudyError: an argument out of range, or a controller that cannot be exported.
     """
     _check_arguments(target, name, dac_bits)
+    if pil is not None:
+        _check_processor(pil, target, is_verified)
     out = Path(out)
     check_folder(out)
     console = console or Console(highlight=False, markup=False)
@@ -78,6 +85,8 @@ def export_design(
     if needs_compiler and not compiler:
         if is_verified:
             raise StudyError(f"--verify: {NO_COMPILER}")
+        if pil is not None:
+            raise StudyError(f"--pil {pil}: {NO_COMPILER}")
         if is_verified is None:
             console.print(f"not verified: {NO_COMPILER}")
         is_verified = False
@@ -94,6 +103,7 @@ def export_design(
         is_verified=is_verified,
         dac_bits=dac_bits or DAC_BITS,
         console=console,
+        board=None if pil is None else BOARDS[pil],
     )
     result = TARGETS[target].make(job)
     for file in result.files:
@@ -103,7 +113,7 @@ def export_design(
     is_good = verified is None or verified.is_passed
     texts = result.files if is_good else {}  # files of an earlier export stay unchanged
     if verified is not None:
-        text = report(exported, job.origin, result.loop, verified, result.fixed, result.cost)
+        text = report(exported, job.origin, result)
         texts |= {REPORT if is_good else FAILED: text}
         _print_verdict(verified, console)
     with publish(out, stale=(REPORT, FAILED) if is_good else ()) as staging:
@@ -126,6 +136,17 @@ def _check_arguments(target: str, name: str, dac_bits: int | None) -> None:
     low, high = _DAC_BITS
     if not low <= dac_bits <= high:
         raise field_error("--dac-bits", dac_bits, f"{low} to {high}", "1")
+
+
+def _check_processor(pil: str, target: str, is_verified: bool | None) -> None:
+    if pil not in BOARDS:
+        raise field_error("--pil", pil, ", ".join(BOARDS), hint=nearest(pil, BOARDS))
+    if not TARGETS[target].has_pil:
+        allowed = ", ".join(name for name, x in TARGETS.items() if x.has_pil)
+        raise StudyError(f"--pil {pil}: not allowed with --target {target}; allowed: {allowed}")
+    if is_verified is False:
+        raise StudyError(f"--pil {pil}: not allowed with --no-verify; leave one of them out")
+    check_tools()
 
 
 def _origin(exported: FixedController, case_id: str) -> list[str]:

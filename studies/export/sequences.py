@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 #: Samples of each sequence.
@@ -45,3 +47,28 @@ def stuck_at_end(recorded: np.ndarray, top: int, channel: tuple[int, int]) -> np
     codes = np.array(recorded)
     codes[len(codes) // 3 :, channel[0], channel[1]] = top
     return codes
+
+
+def episodes(count: int, shape: tuple[int, int], top: int, rail: int) -> Iterator[np.ndarray]:
+    """Random codes in which every second sequence has a sensor fault, each to begin at rest.
+
+    Args:
+        count: sequences.
+        shape: links and patches.
+        top: highest code.
+        rail: samples at an end after which a sensor is faulty.
+
+    Yields:
+        (LENGTH, 3, K) each.
+    """
+    rng = np.random.default_rng(2)
+    for episode in range(count):
+        # steps of random size and length around mid-scale, which excite all filters
+        size, length = top * 10 ** rng.uniform(-3, -0.31), int(rng.integers(1, 60))
+        steps = rng.normal(0, size, (LENGTH // length + 1, *shape))
+        codes = np.clip(np.round(top / 2 + np.repeat(steps, length, axis=0)), 1, top - 1)[:LENGTH]
+        if episode % 2:
+            begin = int(rng.integers(LENGTH // 2, LENGTH - rail))
+            at = int(rng.integers(shape[0])), int(rng.integers(shape[1]))
+            codes[begin : begin + rail, *at] = rng.choice([0, top, min(top + 1, 2**16 - 1)])
+        yield codes

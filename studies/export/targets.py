@@ -21,7 +21,9 @@ from studies.export.c_floating import floating_source
 from studies.export.c_text import Source
 from studies.export.cost import cost_of
 from studies.export.document import document, schema, to_json
-from studies.export.fixed import FixedPoint, check_words, design_fixed, rounded
+from studies.export.firmware.on_target import Comparison, verify_on_target
+from studies.export.firmware.project import project_files
+from studies.export.fixed import FixedPoint, Wires, check_words, design_fixed, rounded
 from studies.export.fixed_blocks import FixedBlocks, design_blocks, rounded_blocks
 from studies.export.floating import BlockSignals, Signals, respond
 from studies.export.job import ExportResult, Job, check_loop, reference_motion
@@ -36,6 +38,7 @@ class Target(NamedTuple):
     make: Callable[[Job], ExportResult]
     needs_compiler: bool = False  # for verification
     has_dac: bool = False  # accepts the resolution of a DAC
+    has_pil: bool = False  # runs on the emulated processors
 
 
 def _export_json(job: Job) -> ExportResult:
@@ -66,7 +69,7 @@ def _export_floating(job: Job) -> ExportResult:
     if drive is not None:
         checks = [*verified.checks, *drive_checks(drive, job.compiler)]
         verified = verified._replace(checks=checks)
-    return ExportResult(files, loop, verified)
+    return _on_target(job, ExportResult(files, loop, verified), source, None)
 
 
 def _export_fixed(job: Job) -> ExportResult:
@@ -85,8 +88,34 @@ def _export_fixed(job: Job) -> ExportResult:
     verified = None
     if job.is_verified:
         verified = verify_fixed(exported, fixed, reference, source, job.name, job.compiler)
-    return ExportResult(
+    result = ExportResult(
         files=_files(source, job.name), loop=loop, verified=verified, fixed=fixed, cost=cost
+    )
+    return _on_target(job, result, source, fixed.wires)
+
+
+def _on_target(job: Job, result: ExportResult, source: Source, wires: Wires | None) -> ExportResult:
+    """An export with its project, compared on the emulated processor; as it is without one."""
+    if job.board is None or result.verified is None:
+        return result
+    job.console.print(f"on the target: {job.board.text}, emulated")
+    found = verify_on_target(
+        Comparison(
+            exported=job.exported,
+            source=source,
+            name=job.name,
+            board=job.board,
+            wires=wires,
+            compiler=job.compiler,
+            verified=result.verified,
+        )
+    )
+    verified = result.verified
+    runs = verified.runs if found.run is None else verified.runs | {job.board.text: found.run}
+    return result._replace(
+        files=result.files | project_files(source, job.name, job.board, wires is not None),
+        verified=verified._replace(checks=[*verified.checks, *found.checks], runs=runs),
+        on_target=found,
     )
 
 
@@ -112,7 +141,7 @@ TARGETS: Table[Target] = Table(
     "target",
     [
         Target("json", "all numbers with units and meanings", _export_json),
-        Target("c", "C99 in floating point", _export_floating, needs_compiler=True),
-        Target("c-fixed", "C99 in 32-bit fixed point", _export_fixed, True, has_dac=True),
+        Target("c", "C99 in floating point", _export_floating, True, has_pil=True),
+        Target("c-fixed", "C99 in 32-bit fixed point", _export_fixed, True, True, has_pil=True),
     ],
 )

@@ -15,7 +15,7 @@ from studies.engine.controller import FixedController, arrange
 from studies.engine.programs import kept_jit
 from studies.export.c_drive import DriveCode, compare_drive
 from studies.export.c_text import Source
-from studies.export.compiler import Code, compiled
+from studies.export.compiler import Code, Responding, compiled
 from studies.export.document import Document, controller_of
 from studies.export.fixed import FixedPoint, rail_samples, shaper_row
 from studies.export.fixed_blocks import FixedBlocks
@@ -57,12 +57,20 @@ class LoopDeviation(NamedTuple):
     loss: float  # residual vibration, rms over links, over that with JAX, minus 1 [1]
 
 
+class Exchange(NamedTuple):
+    """A sequence that a controller was given, and what it must answer, both in its own units."""
+
+    sensor: np.ndarray  # (T, 3, K)
+    actuator: np.ndarray  # (T, 3, K)
+
+
 class Verification(NamedTuple):
     """All comparisons."""
 
     checks: list[Check]
     notes: list[str]  # remarks that do not fail the verification
     runs: dict[str, LoopRun]  # by controller, JAX first
+    exchanges: dict[str, Exchange]  # by sequence
     counts: dict[str, Response]  # fixed point: by sequence
 
     def deviation(self, name: str) -> LoopDeviation:
@@ -100,7 +108,7 @@ def verify_document(
     controller, taps = controller_of(document)
     channels = arrange(controller, document.law)
     checks = [
-        _compare(
+        compare_values(
             f"open loop, {name}",
             respond_floating(channels, controller, codes).command,
             _replay(exported, codes),
@@ -112,11 +120,11 @@ def verify_document(
             **_hard_codes(exported, reference),
         }.items()
     ]
-    path, shaped = _references(exported)
+    path, shaped = reference_path(exported)
     checks.append(
-        _compare("shaper, the case's motion", _shape_reference(taps, path), shaped, DOUBLE)
+        compare_values("shaper, the case's motion", _shape_reference(taps, path), shaped, DOUBLE)
     )
-    return Verification(checks, [], {"JAX": reference}, {})
+    return Verification(checks=checks, notes=[], runs={"JAX": reference}, exchanges={}, counts={})
 
 
 def verify_floating(
@@ -127,21 +135,22 @@ def verify_floating(
     compiler: list[str],
 ) -> Verification:
     """C in double and single precision against the JAX controller."""
-    checks, runs = [], {"JAX": reference}
+    checks, runs, exchanges = [], {"JAX": reference}, dict[str, Exchange]()
     with load_code(exported, source, name, compiler, np.float64, np.float64) as code:
         sequences = {"recorded codes": reference.codes, **_hard_codes(exported, reference)}
         for label, codes in sequences.items():
-            volts, faults = code.respond(codes * float(exported.controller.adc_step))
-            expected = _replay(exported, codes)
+            sensor, expected = codes * float(exported.controller.adc_step), _replay(exported, codes)
+            exchanges[label] = Exchange(sensor, expected)
+            volts, faults = code.respond(sensor)
             largest = _largest_demand(exported, codes)
-            check = _compare(f"open loop, {label}", volts, expected, DOUBLE, largest)
+            check = compare_values(f"open loop, {label}", volts, expected, DOUBLE, largest)
             checks.append(check._replace(is_met=check.is_met and not faults.any()))
         top = float(exported.controller.adc_top + 3)
         bad = {"beyond the range": top, "NaN": np.nan, "infinite": np.inf}
         step = float(exported.controller.adc_step)
-        checks += _check_faults(exported, code, reference, bad, step, 0.0)
-        path, shaped = _references(exported)
-        checks.append(_compare("shaper, the case's motion", code.shape(path), shaped, DOUBLE))
+        checks += check_faults(exported, code, reference, bad, step, 0.0)
+        path, shaped = reference_path(exported)
+        checks.append(compare_values("shaper, the case's motion", code.shape(path), shaped, DOUBLE))
         shape = reference.codes.shape[1:]
         code.begin()
         runs["C, double"] = run_in_the_loop(
@@ -151,11 +160,17 @@ def verify_floating(
         )
     with load_code(exported, source, name, compiler, np.float32, np.float32) as code:
         volts, _ = code.respond(reference.codes * step)
-        checks += _check_faults(exported, code, reference, bad, step, 0.0, ", float")
-        single = _compare("", volts, reference.voltage, SINGLE)
+        checks += check_faults(exported, code, reference, bad, step, 0.0, ", float")
+        single = compare_values("", volts, reference.voltage, SINGLE)
         advice = "precise enough" if single.is_met else "NOT precise enough, keep to double"
         note = f"With float, recorded codes in open loop differ by {single.found}: {advice}."
-    return Verification([*checks, *_check_status(runs)], [note], runs, {})
+    return Verification(
+        checks=[*checks, *_check_status(runs)],
+        notes=[note],
+        runs=runs,
+        exchanges=exchanges,
+        counts={},
+    )
 
 
 def verify_fixed(
@@ -208,7 +223,7 @@ def verify_fixed(
             if fixed.wires.adc_top < 2**16 - 1
             else {}
         )
-        checks += _check_faults(exported, code, reference, bad, 1.0, float(fixed.wires.dac_rest))
+        checks += check_faults(exported, code, reference, bad, 1.0, float(fixed.wires.dac_rest))
         checks.append(_check_shaper(exported, code))
     checks.append(_check_error(exported, fixed, reference, counts["recorded codes"]))
     for label in ("recorded codes", "own run in the loop"):
@@ -218,7 +233,14 @@ def verify_fixed(
         )
     limited = sum(int(response.limited.sum()) for response in counts.values())
     checks.append(Check("internal overflow, all sequences", f"{limited} times", "0", limited == 0))
-    return Verification([*checks, *_check_status(runs)], [], runs, counts)
+    exchanges = {label: Exchange(codes, counts[label].codes) for label, codes in sequences.items()}
+    return Verification(
+        checks=[*checks, *_check_status(runs)],
+        notes=[],
+        runs=runs,
+        exchanges=exchanges,
+        counts=counts,
+    )
 
 
 def _model_responses(
@@ -283,7 +305,7 @@ def _largest_demand(exported: FixedController, codes: np.ndarray) -> float:
     return float(np.abs(signals.demand).max())
 
 
-def _compare(
+def compare_values(
     what: str, values: np.ndarray, expected: np.ndarray, allowed: float, rounded: float = 0.0
 ) -> Check:
     """Largest difference over the largest value, or over a larger one that was rounded."""
@@ -307,9 +329,9 @@ def _stuck_codes(exported: FixedController, reference: LoopRun) -> np.ndarray:
     )
 
 
-def _check_faults(
+def check_faults(
     exported: FixedController,
-    code: Code,
+    code: Responding,
     reference: LoopRun,
     bad: dict[str, float],
     scale: float,
@@ -348,7 +370,7 @@ def _check_faults(
     return checks
 
 
-def _references(exported: FixedController) -> tuple[np.ndarray, np.ndarray]:
+def reference_path(exported: FixedController) -> tuple[np.ndarray, np.ndarray]:
     """Planned poses and JAX's shaped ones at the samples, (T, 3)."""
     n, period = exported.structure.n_steps, float(exported.case.electronics.period)
     taps = Taps(jnp.asarray(exported.taps.weight), jnp.asarray(exported.taps.sample))
@@ -381,11 +403,16 @@ def _shape_reference(taps: Taps, path: np.ndarray) -> np.ndarray:
     return sum(parts)
 
 
+def path_counts(path: np.ndarray) -> tuple[np.ndarray, float]:
+    """A path in whole counts, and how many of them make a metre or radian."""
+    scale = min(REFERENCE_COUNTS, 2.0**30 / np.abs(path).max())
+    return np.round(path * scale).astype(np.int64), float(scale)
+
+
 def _check_shaper(exported: FixedController, code: Code) -> Check:
     """The shaper in fixed point: bit by bit like its integer model, within a count of JAX's."""
-    path, shaped = _references(exported)
-    scale = min(REFERENCE_COUNTS, 2.0**30 / np.abs(path).max())
-    counts = np.round(path * scale).astype(np.int64)
+    path, shaped = reference_path(exported)
+    counts, scale = path_counts(path)
     counts_out = code.shape(counts)
     row = shaper_row(exported.taps)
     total = _shape_reference(exported.taps._replace(weight=row.integers[0]), counts)
