@@ -1,6 +1,8 @@
 from .atlas.run import run_atlas
 from .bench.run import run_bench
 from .cache import cache_contents
+from .commission.run import run_commission
+from .commission.spec import load_measured
 from .config import configure, info
 from .engine.batched import batched
 from .engine.dataset import load
@@ -62,6 +64,7 @@ __all__ = [
     "load",
     "load_design",
     "load_fit",
+    "load_measured",
     "load_study",
     "load_sweep",
     "load_tuning",
@@ -76,6 +79,7 @@ __all__ = [
     "replay",
     "run_atlas",
     "run_bench",
+    "run_commission",
     "run_fit",
     "run_laws",
     "run_paper",

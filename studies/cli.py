@@ -21,6 +21,7 @@ from studies import __version__
 from studies.atlas.commands import add_commands as add_atlas
 from studies.bench.commands import add_commands as add_bench
 from studies.cache import KINDS, VARIABLE, Kept, cache_contents, is_shared
+from studies.commission.commands import add_commands as add_commission
 from studies.config import PACKAGE, configure, keep_programs, start
 from studies.errors import OWN_WARNINGS, StudyError, printable
 from studies.export.commands import add_commands as add_export
@@ -171,6 +172,7 @@ for add_commands in (
     add_atlas,
     add_spillover,
     add_laws,
+    add_commission,
     add_twin,
     add_bench,
 ):

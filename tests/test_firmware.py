@@ -11,6 +11,7 @@ from studies.errors import StudyError
 from studies.export import sequences
 from studies.export.firmware import build as building
 from studies.export.firmware import on_target, project
+from studies.export.firmware.boards import BOARDS
 from studies.export.firmware.build import (
     COMPILER,
     EMULATOR,

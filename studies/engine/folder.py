@@ -69,6 +69,11 @@ COMPARISONS = Content(
 )
 
 
+COMMISSIONINGS = Content(
+    "a commissioning", "request.json", re.compile(r"\.unfinished-.*|\..+\.[0-9a-f]{8}\.tmp")
+)
+
+
 class Finished(NamedTuple):
     """Where finished cases are."""
 
@@ -248,6 +253,33 @@ def make_manifest(data: dict[str, Any], modules: Iterable[str] = DECISIVE) -> di
         "git": git_state(),
         **config.origin(),
     }
+
+
+def keep_request(file: Path, request: dict[str, Any], checked: Iterable[str], what: str) -> None:
+    """Write what is asked for, or check that a folder was begun with the same.
+
+    Args:
+        file: where, in the folder.
+        request: from `make_manifest`, and more.
+        checked: its entries that must be the same.
+        what: may have changed, in words.
+
+    Raises:
+        StudyError: the folder was begun with something else.
+    """
+    request = json.loads(json.dumps(request))
+    if file.is_file():
+        try:
+            before = read_json(file)
+        except (OSError, ValueError):
+            before = None
+        if not isinstance(before, dict) or any(before.get(x) != request[x] for x in checked):
+            raise StudyError(
+                f"--out {file.parent}: was begun with another {what}; name a new folder"
+            )
+        return
+    with replacing(file) as temporary:
+        temporary.write_text(json.dumps(request, indent=1), encoding="utf-8")
 
 
 def read_manifest(path: Path) -> dict[str, Any]:

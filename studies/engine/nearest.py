@@ -22,9 +22,11 @@ from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 from studies.engine.eigenvalues import eigenvalues
 
 #: Motions that begin, those nearest to the limit, by steps so far from zero [tolerances].
-MOTIONS, BEGINNING, RADIUS = 20, 2, 4.0
+MOTIONS, BEGINNING, RADIUS = 36, 2, 4.0
 #: Motions that go on, and steps of each.
-STARTS, STEPS = 8, 6
+STARTS, STEPS = 12, 6
+#: Of motions of one frequency, as the three of equal links are, so many come before the others.
+FIRST_ALIKE, SAME_FREQUENCY = 2, 0.01
 #: Steps along the limit of all that arrive; how many go on; their steps.
 FIRST, KEPT, SLIDES = 3, 2, 10
 #: Threads: JAX and LAPACK run beside each other.
@@ -58,6 +60,11 @@ class _Pole(NamedTuple):
     right: np.ndarray  # v, M v = z v, (n,)
     left: np.ndarray  # w, w'M = z w', (n,)
     size: complex  # z w'v
+
+    @property
+    def turn(self) -> float:
+        """Angle by which the motion turns in a sample [rad]."""
+        return float(abs(np.angle(self.size / (self.left @ self.right))))
 
     @property
     def weight(self) -> np.ndarray:
@@ -190,10 +197,20 @@ def _chosen(begun: list[_Start]) -> list[_Start]:
 
     Damping that shrinks by a factor never reaches zero, though its slope says where it would.
     """
-    by_distance = sorted(begun, key=lambda one: one.distance)[: STARTS // 2]
+    by_distance = _varied(sorted(begun, key=lambda one: one.distance))[: STARTS // 2]
     rest = [one for one in begun if not any(one is other for other in by_distance)]
-    by_growth = sorted(rest, key=lambda one: -one.pole.growth)
+    by_growth = _varied(sorted(rest, key=lambda one: -one.pole.growth))
     return by_distance + by_growth[: STARTS - len(by_distance)]
+
+
+def _varied(starts: list[_Start]) -> list[_Start]:
+    """The same in the same order, but of one frequency no more than `FIRST_ALIKE` at first."""
+    first, later = list[_Start](), list[_Start]()
+    for one in starts:
+        turn = one.pole.turn
+        alike = sum(abs(other.pole.turn - turn) <= SAME_FREQUENCY * turn for other in first)
+        (first if alike < FIRST_ALIKE else later).append(one)
+    return first + later
 
 
 def _next_pole(pole: _Pole, poles: list[_Pole]) -> _Pole:

@@ -149,6 +149,10 @@ def document(fitted: Fitted) -> str:
             for x in fitted.rivals
         ],
         "correlation": answer.correlation.tolist(),
+        "experiments": [
+            {"text": x.text, "pose": list(x.pose), "widest": float(x.widest)}
+            for x in fitted.experiments
+        ],
         "held_out": [
             {"name": x.name, "numbers": x.size, "chi_square": x.square, "is_noise": x.is_noise}
             for x in fitted.checks

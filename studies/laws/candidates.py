@@ -76,7 +76,7 @@ def law_candidates(study: Study) -> list[Contender]:
     for name, law in LAWS.items():
         if name != study.control.law and name == "state_space":
             continue
-        one = _law_candidate(study, law)
+        one = law_candidate(study, law)
         found.append(one)
         fixed = {field: x for field, x in one.free.items() if not field.startswith(RATIOS)}
         if len(fixed) < len(one.free) and name == study.control.law:
@@ -84,7 +84,13 @@ def law_candidates(study: Study) -> list[Contender]:
     return found
 
 
-def _law_candidate(study: Study, law: Law) -> Contender:
+def law_candidate(study: Study, law: Law) -> Contender:
+    """A law on a study's machine, and the numbers that its controller depends on.
+
+    Args:
+        study: the design, with sampled feedback.
+        law: which one.
+    """
     settings: dict[str, Any] = {}
     if study.control.has_poles and not law.places_poles:  # first: without them any law is valid
         settings = {"control.damping": (), "control.pole_decay": ()}

@@ -6,7 +6,6 @@ comparison goes on where it was. `request.json` says what was asked for.
 
 from __future__ import annotations
 
-import json
 import re
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -15,11 +14,17 @@ from threading import Event, Lock
 from rich.console import Console
 
 from studies import config
-from studies.engine.folder import COMPARISONS, locked_folder, make_manifest, refuse_existing
+from studies.engine.folder import (
+    COMPARISONS,
+    keep_request,
+    locked_folder,
+    make_manifest,
+    refuse_existing,
+)
 from studies.engine.progress import Phases
 from studies.engine.runs import resolved_study
 from studies.engine.sweep import run_sweep, sweep_phases
-from studies.errors import StudyError, field_error
+from studies.errors import field_error
 from studies.laws import plots
 from studies.laws.candidates import drive_candidates, law_candidates
 from studies.laws.findings import (
@@ -35,8 +40,7 @@ from studies.laws.judging import judging_sweep, read_judged
 from studies.laws.machines import machines_of, with_noise
 from studies.laws.report import document, report
 from studies.laws.tuning import Budget, Tuned, make_budget, tune_candidate
-from studies.publish import REPORT, publish, replacing
-from studies.reading import read_json
+from studies.publish import REPORT, publish
 from studies.show.figures import save, styled, write_figure
 from studies.show.sketch import sketch
 from studies.space.spec import SweepSpec
@@ -83,7 +87,9 @@ def run_laws(
     budget = make_budget(study, voltage, margin)
     with locked_folder(out, "comparison"):
         refuse_existing(out, COMPARISONS, is_resumed)
-        _keep_request(out / COMPARISONS.mark, study, budget)
+        request = make_manifest(study.model_dump(mode="json"), DECISIVE) | budget._asdict()
+        checked = "spec", "code", *Budget._fields
+        keep_request(out / COMPARISONS.mark, request, checked, "design, budget or program")
         names = ("tune", *sweep_phases(_empty_sweep(study)), "rank", "draw")
         with Phases(console, names, is_quiet) as phases:
             return _compare(study, out, budget, phases)
@@ -102,32 +108,6 @@ def _check_design(study: Study) -> None:
         raise field_error("control.links", control.links, "one or more controlled links")
     if control.gain_factor == 0:
         raise field_error("control.gain_factor", 0.0, "more than 0 where laws are compared")
-
-
-def _keep_request(file: Path, study: Study, budget: Budget) -> None:
-    """Write what is asked for, or check that the folder's is the same.
-
-    Raises:
-        StudyError: it is not.
-    """
-    request = json.loads(
-        json.dumps(make_manifest(study.model_dump(mode="json"), DECISIVE) | budget._asdict())
-    )
-    if file.is_file():
-        try:
-            before = read_json(file)
-        except (OSError, ValueError):
-            before = None
-        if not isinstance(before, dict) or any(
-            before.get(key) != request[key] for key in ("spec", "code", *Budget._fields)
-        ):
-            raise StudyError(
-                f"--out {file.parent}: was begun with another design, budget or program; name a "
-                "new folder"
-            )
-        return
-    with replacing(file) as temporary:
-        temporary.write_text(json.dumps(request, indent=1), encoding="utf-8")
 
 
 #: Modules that determine the numbers, with everything they import.

@@ -1,0 +1,163 @@
+"""From the file to the folder: stage after stage, each done once, or a refusal with reasons.
+
+`request.json` says what was asked for; a stage whose answer is in its folder is not done again.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from rich.console import Console
+
+from studies import config
+from studies.commission.machines import margins_on
+from studies.commission.report import CommissionFindings, document, report, summary
+from studies.commission.spec import MeasuredSpec
+from studies.commission.stages import (
+    STAGES,
+    Stage,
+    certificate_document,
+    fit_document,
+    is_verified,
+    possible_machines,
+    tuned_design,
+)
+from studies.engine.folder import (
+    COMMISSIONINGS,
+    keep_request,
+    locked_folder,
+    make_manifest,
+    refuse_existing,
+)
+from studies.errors import StudyError
+from studies.publish import REPORT, announce, publish, replacing, shown
+
+DOCUMENT, MARGINS = "commission.json", "margins.npy"
+#: Modules that determine the numbers, with everything they import.
+DECISIVE = ("studies.commission.stages", "studies.commission.machines")
+
+
+class Commissioned(NamedTuple):
+    """A commissioning as far as it went."""
+
+    out: Path
+    outcome: CommissionFindings
+
+    @property
+    def is_good(self) -> bool:
+        """Whether there is firmware that can be used."""
+        return not self.outcome.refusals
+
+    def _repr_html_(self) -> str:
+        return shown(self)
+
+
+def run_commission(
+    measured: MeasuredSpec,
+    out: str | Path,
+    is_resumed: bool = False,
+    console: Console | None = None,
+) -> Commissioned:
+    """Lead from measurements to verified firmware, or refuse and say what is missing.
+
+    Args:
+        measured: from `load_measured`.
+        out: folder; each stage has one of its own in it.
+        is_resumed: go on with an interrupted commissioning.
+        console: where messages go; default: standard output.
+
+    Raises:
+        StudyError: a fault of the file or the folder; a stage that cannot run.
+    """
+    config.require_configured()
+    out, console = Path(out), console or Console(highlight=False, markup=False)
+    with locked_folder(out, "commissioning"):
+        refuse_existing(out, COMMISSIONINGS, is_resumed)
+        request = make_manifest(measured.data, DECISIVE)
+        keep_request(out / COMMISSIONINGS.mark, request, ("spec", "code"), "file or program")
+        outcome = _outcome(measured, out, console)
+        with publish(out) as staging:
+            (staging / DOCUMENT).write_text(document(measured, outcome), encoding="utf-8")
+            (staging / REPORT).write_text(report(measured, outcome), encoding="utf-8")
+    for line in summary(outcome):
+        console.print(line, soft_wrap=True)
+    announce(console, out / REPORT)
+    return Commissioned(out, outcome)
+
+
+def _outcome(measured: MeasuredSpec, out: Path, console: Console) -> CommissionFindings:
+    """All stages, up to the first one whose answer does not support the next."""
+    outcome = CommissionFindings(out)
+    for stage in STAGES:
+        fault = _run(stage, measured, out, console)
+        outcome = _judged(outcome, stage, fault, measured, console)
+        if outcome.refusals:
+            break
+    return outcome
+
+
+def _run(stage: Stage, measured: MeasuredSpec, out: Path, console: Console) -> str:
+    """Do a stage unless it is done; what it refuses, "" if nothing."""
+    number = f"stage {STAGES.index(stage) + 1} of {len(STAGES)}, {stage.name}"
+    if stage.is_done(out):
+        console.print(f"{number}: done before")
+        return ""
+    console.print(f"{number}: {stage.text}")
+    try:
+        stage.make(measured, out, console)
+    except StudyError as error:
+        if stage is STAGES[0]:  # nothing is known yet: the file is at fault
+            raise
+        return str(error)
+    return ""
+
+
+def _judged(
+    outcome: CommissionFindings, stage: Stage, fault: str, measured: MeasuredSpec, console: Console
+) -> CommissionFindings:
+    """The outcome with a stage's answer, and with what speaks against going on."""
+    out, wanted = outcome.out, measured.commission.gain_margin
+    refusals = [f"{stage.name}: {fault}"] if fault else []
+    if stage.name == "fit":
+        fit = fit_document(out)
+        outcome = outcome._replace(fit=fit)
+        refusals += _unsupported(fit)
+    elif stage.name == "tune" and not fault:
+        margins = _margins(out, console)
+        outcome = outcome._replace(tuned=tuned_design(out).study, margins=margins)
+        low = int(np.sum(margins < wanted))
+        if low:
+            refusals.append(
+                f"on {low} of {len(margins)} machines that the data leave possible the gain margin "
+                f"is below {wanted:g}, down to {margins.min():.3g}"
+            )
+    elif stage.name == "certificate" and not fault:
+        certificate = certificate_document(out)
+        outcome = outcome._replace(certificate=certificate)
+        if not certificate["is_passed"]:
+            refusals.append(f"certificate {certificate['verdict']}")
+    elif stage.name == "firmware" and not fault and not is_verified(out):
+        refusals.append("the exported code does not behave as the controller that was designed")
+    return outcome._replace(done=stage.name, refusals=tuple(refusals))
+
+
+def _unsupported(fit: dict) -> list[str]:  # type: ignore[type-arg]
+    """Why a fit is no ground for a design, from its messages."""
+    if not fit["is_explained"] or not fit["is_converged"]:
+        return [str(text) for text in fit["messages"][:3]]
+    return []
+
+
+def _margins(out: Path, console: Console) -> np.ndarray:
+    """Gain margins on all possible machines, kept in the folder."""
+    file = out / "tune" / MARGINS
+    if file.is_file():
+        return np.load(file)
+    machines = possible_machines(out)
+    console.print(f"gain margins on {len(machines.values)} machines that the data leave possible")
+    margins = margins_on(machines, tuned_design(out).study)
+    with replacing(file) as temporary, open(temporary, "wb") as target:
+        np.save(target, margins)
+    return margins

@@ -1,0 +1,134 @@
+"""The file of a commissioning: a fit, what is wanted of the controller, and what it runs on.
+
+`[fit]` is that of `studies fit`. `[tune]`, as of `studies tune`, may be left out or name only what
+differs from the default; its machines are those of the fit. `[commission]` is described here.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pydantic import ValidationError
+
+from jaxmodel.laws import LAWS
+from studies.errors import StudyError, field_error, nearest
+from studies.export.firmware.boards import BOARDS
+from studies.export.run import DAC_BITS
+from studies.export.targets import TARGETS
+from studies.fitting.spec import FitSpec, parse_fit
+from studies.laws.candidates import RATIOS, law_candidate
+from studies.study.explain import explain
+from studies.study.files import find_spec, read_toml
+from studies.study.spec import Section, Study, described
+
+#: Its section.
+SECTION = "commission"
+#: Starting points and iterations of a tuning, machines it is tuned on and judged on.
+STARTS, ITERATIONS, TUNED_ON, JUDGED_ON = 4, 30, 3, 12
+#: Factor by which a tuning keeps more than the required gain margin: the true machine is none of
+#: those that it is tuned on.
+RESERVE = 1.1
+
+
+class Commission(Section):
+    """What is wanted, and for which processor."""
+
+    target: str = described("c-fixed", "-", "of studies export: c or c-fixed")
+    processor: str = described(
+        "", "-", "emulated one that runs the code, as studies export --pil; empty: none"
+    )
+    dac_bits: int = described(DAC_BITS, "1", "resolution of the DAC, for c-fixed", ge=4, le=16)
+    gain_margin: float = described(
+        2.0, "1", "least gain margin on every machine that the data leave possible", ge=1, le=16
+    )
+
+
+class MeasuredSpec(NamedTuple):
+    """What a commissioning starts from."""
+
+    fit: FitSpec
+    tune: dict[str, Any]  # section [tune] as written
+    commission: Commission
+    data: dict[str, Any]  # the whole file
+
+    @property
+    def study(self) -> Study:
+        """The design before anything was measured."""
+        return self.fit.study
+
+
+def load_measured(path: str | Path) -> MeasuredSpec:
+    """Read a file of a commissioning.
+
+    Raises:
+        StudyError: unreadable, not TOML, or not valid.
+    """
+    return parse_measured(read_toml(path), find_spec(path).parent)
+
+
+def parse_measured(data: dict[str, Any], folder: str | Path = ".") -> MeasuredSpec:
+    """Validate a dictionary as a commissioning.
+
+    Args:
+        data: sections of a study, `fit`, and optionally `tune` and `commission`.
+        folder: where the files of the data are.
+
+    Raises:
+        StudyError: first fault found, with field, value, allowed range and unit.
+    """
+    rest = {name: value for name, value in data.items() if name not in ("tune", SECTION)}
+    fit = parse_fit(rest, folder)
+    written = data.get(SECTION, {})
+    try:
+        commission = Commission.model_validate(written)
+    except ValidationError as error:
+        raise explain(error, Commission, written, inside=SECTION) from None
+    targets = [name for name, x in TARGETS.items() if x.has_pil]
+    _check_name("target", commission.target, targets)
+    if commission.processor:
+        _check_name("processor", commission.processor, list(BOARDS))
+    control = fit.study.control
+    if control.feedback != "sampled":
+        raise field_error("control.feedback", control.feedback, "'sampled' for a controller")
+    tune = data.get("tune", {})
+    if not isinstance(tune, dict):
+        raise field_error("tune", tune, "a section, as of studies tune")
+    if "machines" in tune.get("scenarios", {}):
+        raise StudyError("tune.scenarios.machines: not allowed here; they are those of the fit")
+    return MeasuredSpec(fit=fit, tune=tune, commission=commission, data=data)
+
+
+def _check_name(field: str, value: str, allowed: list[str]) -> None:
+    if value not in allowed:
+        name = f"{SECTION}.{field}"
+        raise field_error(name, value, ", ".join(allowed), hint=nearest(value, allowed))
+
+
+def tuning_section(
+    measured: MeasuredSpec, study: Study, machines: dict[str, list[float]]
+) -> dict[str, Any]:
+    """Section [tune] for a fitted study.
+
+    Args:
+        measured: what was asked for.
+        study: the fitted one.
+        machines: that the data leave possible, by field.
+    """
+    written = measured.tune
+    own = law_candidate(study, LAWS[study.control.law])
+    free = {name: x for name, x in own.free.items() if not name.startswith(RATIOS)}
+    default = {
+        "free": free,
+        "objective": {"residual_rms": 1.0},
+        "starts": STARTS,
+        "iterations": ITERATIONS,
+    }
+    margin = RESERVE * measured.commission.gain_margin
+    limits = {"gain_margin": margin} | written.get("limits", {})
+    scenarios = {"count": TUNED_ON, "check": JUDGED_ON} | written.get("scenarios", {})
+    if machines:
+        scenarios["machines"] = machines
+    else:
+        scenarios["count"] = 1
+    return default | written | {"limits": limits, "scenarios": scenarios}
