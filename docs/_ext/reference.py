@@ -13,6 +13,7 @@ from pydantic_core import PydanticUndefined
 
 from jaxmodel.metrics import METRICS
 from studies.cli import app
+from studies.commission.spec import Commission
 from studies.fitting.spec import ENTRIES, Fit
 from studies.space.spec import Block, Screen, Sweep
 from studies.study.explain import allowed_values, unit_of
@@ -112,6 +113,7 @@ def fields_text() -> str:
         _section_text("[fit]", Fit),
     ]
     parts += [_section_text(f'[[fit.data]], kind = "{kind}"', x) for kind, x in ENTRIES.items()]
+    parts += ["## A commissioning", _section_text("[commission]", Commission)]
     return "\n\n".join(parts)
 
 

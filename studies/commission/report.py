@@ -37,12 +37,14 @@ def found_text(outcome: CommissionFindings) -> str:
     """What the measurements say of the machine."""
     if outcome.fit is None:
         return "Found: nothing yet."
-    numbers = "; ".join(
-        f"{x['name']} {x['value']:.5g} +- {x['sigma']:.2g} {number_unit(x['name'])}".removesuffix(" 1")
-        for x in outcome.fit["numbers"]
-    )
+    numbers = "; ".join(map(_number_text, outcome.fit["numbers"]))
     how = "the model explains the data" if outcome.fit["is_explained"] else "NOT EXPLAINED"
     return f"Found ({how}): {numbers}."
+
+
+def _number_text(x: dict[str, Any]) -> str:
+    text = f"{x['name']} {x['value']:.5g} +- {x['sigma']:.2g} {number_unit(x['name'])}"
+    return text.removesuffix(" 1")
 
 
 def chosen_text(outcome: CommissionFindings) -> str:

@@ -10,6 +10,7 @@ from rich.console import Console
 from studies.engine.preflight import check_run
 from studies.engine.progress import Phases
 from studies.errors import StudyError
+from studies.fitting.diagnosis import Remedy, diagnose
 from studies.fitting.draw import draw_machines
 from studies.fitting.experiment import Experiment, next_experiments
 from studies.fitting.kinds.contract import DataAndModel, Measurement
@@ -49,6 +50,7 @@ class Fitted(NamedTuple):
     fault: str  # why the fitted study does not run, "" if it does
     experiments: tuple[Experiment, ...] = ()  # the most telling first; none if the model fails
     experiment_fault: str = ""  # why none was found
+    remedies: tuple[Remedy, ...] = ()  # of a misfit, the most effective first
 
     def _repr_html_(self) -> str:
         return shown(self)
@@ -142,7 +144,9 @@ def estimate(spec: FitSpec, phases: Phases | None = None) -> Fitted:
 def suggest(fitted: Fitted, phases: Phases) -> Fitted:
     """The same with the next experiment, or with the reason why there is none."""
     if not fitted.answer.is_explained:  # a wrong model does not know what it would learn
-        return fitted
+        phases.begin("next experiment", "none for a wrong model; what would mend it")
+        remedies = diagnose(fitted.spec, fitted.problem, fitted.solution.best.u)
+        return fitted._replace(remedies=remedies)
     phases.begin("next experiment")
     inputs = (
         fitted.problem.bench,

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 #: Experiments in the report.
 SHOWN = 5
+#: Remedies of a misfit that are told.
+SHOWN_REMEDIES = 3
 #: Correlations from this size on are named [1].
 STRONG = 0.95
 #: The verdict on a fit without a fault.
@@ -124,7 +126,7 @@ def _digits(value: float, sigma: float) -> int:
 def sentences(fitted: Fitted) -> list[str]:
     """What a reader must know before he uses the values, the gravest first."""
     answer = fitted.answer
-    lines = [*_rivals(fitted), *_unexplained(answer)]
+    lines = [*_rivals(fitted), *_remedies(fitted), *_unexplained(answer)]
     if answer.freedom == 0:
         lines.append(
             "There are as many unknowns as data: they are met whatever the model, which is not "
@@ -151,6 +153,15 @@ def sentences(fitted: Fitted) -> list[str]:
     if fitted.experiment_fault:
         lines.append(f"No next experiment could be computed: {fitted.experiment_fault}.")
     return lines
+
+
+def _remedies(fitted: Fitted) -> list[str]:
+    """What would mend a misfit."""
+    return [
+        f"Chi square would be {one.after:.4g} in place of {one.before:.4g} if this is so: "
+        f"{cell(one.text)}."
+        for one in fitted.remedies[:SHOWN_REMEDIES]
+    ]
 
 
 def _rivals(fitted: Fitted) -> list[str]:

@@ -45,13 +45,18 @@ class _BenchMeasurement(Measurement):
             unit: of the response.
         """
         super().__init__(name, is_checked, measured, noise.sigma(measured))
-        self._bench, self._pose, self._signals, self._order = bench, pose, signals, order
+        self._bench, self._pose, self.signals, self._order = bench, pose, signals, order
         self.frequency, self._noise, self._unit = frequency, noise, unit
+
+    @property
+    def n_patches(self) -> int:
+        """Pairs of patches on each link."""
+        return self._bench.n_patches
 
     def predict(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
         plant = self._bench.plant(self._pose, values, has_slopes)
         omega = TWO_PI * self.frequency
-        value, slope = response(plant, self._signals, self._bench.places(self._signals), omega)
+        value, slope = response(plant, self.signals, self._bench.places(self.signals), omega)
         turn = (1j * omega) ** self._order
         return value * turn, None if slope is None else slope * turn[:, None]
 
