@@ -24,7 +24,7 @@ from studies.engine.eigenvalues import eigenvalues
 #: Motions that begin, those nearest to the limit, by steps so far from zero [tolerances].
 MOTIONS, BEGINNING, RADIUS = 36, 2, 4.0
 #: Motions that go on, and steps of each.
-STARTS, STEPS = 12, 6
+STARTS, STEPS = 12, 8
 #: Of motions of one frequency, as the three of equal links are, so many come before the others.
 FIRST_ALIKE, SAME_FREQUENCY = 2, 0.01
 #: Steps along the limit of all that arrive; how many go on; their steps.
@@ -220,7 +220,10 @@ def _next_pole(pole: _Pole, poles: list[_Pole]) -> _Pole:
 
 
 def _descend(loops: Loops, start: _Start) -> np.ndarray | None:
-    """The nearest unstable point on the way of one motion to its limit; None: there is none."""
+    """The nearest unstable point on the way of one motion to its limit; None: there is none.
+
+    It stays with its motion where another one is unstable already: that one has its own start.
+    """
     x, pole, slope, _ = start
     found = [x] if pole.growth > 0 else []
     for _ in range(STEPS):
@@ -234,8 +237,8 @@ def _descend(loops: Loops, start: _Start) -> np.ndarray | None:
         poles = _poles(loops.matrix(x))
         if not poles:
             break
-        pole = _next_pole(pole, poles)
-        if pole.growth > 0:
+        pole = max(poles, key=partial(_likeness, pole))
+        if max(one.growth for one in poles) > 0:
             found.append(x)
         if length < 0.05 * distance:
             break
