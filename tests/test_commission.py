@@ -18,11 +18,12 @@ from studies.commission.stages import STAGES, possible_machines
 from studies.engine.controller import fixed_controller
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
+from studies.export.firmware import build as building
 from studies.show.document import schema
 from studies.study.spec import paper_study
 from studies.tuning.spec import parse_tuning
 from tests.commissions import measured_data
-from tests.fits import SHORT
+from tests.fits import RESPONSE, SHORT, blank
 from tests.pages import parsed, text_of
 
 STUDY = paper_study().change(link__modes=3)
@@ -46,6 +47,7 @@ def data(**sections):
         ({"commission": {"gain_margin": 0.5}}, "commission.gain_margin"),
         ({"commission": {"margin": 2.0}}, "commission.margin"),
         ({"tune": {"scenarios": {"machines": {}}}}, "tune.scenarios.machines"),
+        ({"tune": {"free": {"control.gain": {"from": 0.1, "to": 1.0}}}}, "tune.free.*control.gain"),
         ({"control": {"feedback": "ideal"}}, "control.feedback"),
         ({"fit": {"free": {}, "data": [MODES]}}, "fit.free"),
     ],
@@ -200,11 +202,31 @@ def test_a_stage_is_not_done_twice(monkeypatch, tmp_path):
         commissioned(tmp_path / "out")
     stages.answers["stops"] = ""
     made, text, _ = commissioned(tmp_path / "out", is_resumed=True)
-    assert made.is_good and "stage 1 of 4, fit: done before" in text
+    assert made.is_good and "stage 1 of 4, fit: already computed" in text
     assert stages.calls == ["fit", "tune", "certificate", "certificate", "firmware"]
     other = data(commission={"gain_margin": 3.0})
-    with pytest.raises(StudyError, match="another file or program"):
+    with pytest.raises(StudyError, match="another file, data or program"):
         run_commission(parse_measured(other), tmp_path / "out", True)
+
+
+def test_other_data_are_another_commissioning(monkeypatch, tmp_path):
+    Pretended(monkeypatch)
+    file = tmp_path / "response.csv"
+    entry = RESPONSE | {"file": file.name}
+    blank(tmp_path)
+    measured = parse_measured(data(fit={"free": FREE, "data": [entry]}), tmp_path)
+    run_commission(measured, tmp_path / "out", console=Console(quiet=True))
+    file.write_text(file.read_text().replace("1.0", "1.1", 1))
+    with pytest.raises(StudyError, match="another file, data or program"):
+        run_commission(measured, tmp_path / "out", True)
+
+
+def test_missing_tools_are_found_before_the_fit(monkeypatch, tmp_path):
+    monkeypatch.setattr(building.shutil, "which", lambda _: None)
+    measured = parse_measured(data(commission={"processor": "cortex-m4"}))
+    with pytest.raises(StudyError, match="qemu-system-arm not found"):
+        run_commission(measured, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_the_data_leave_open_is_said():

@@ -32,6 +32,7 @@ from studies.engine.folder import (
     refuse_existing,
 )
 from studies.errors import StudyError
+from studies.export.firmware.build import check_tools
 from studies.publish import REPORT, announce, publish, replacing, shown
 
 DOCUMENT, MARGINS = "commission.json", "margins.npy"
@@ -73,10 +74,13 @@ def run_commission(
     """
     config.require_configured()
     out, console = Path(out), console or Console(highlight=False, markup=False)
+    if measured.commission.processor:
+        check_tools()
     with locked_folder(out, "commissioning"):
         refuse_existing(out, COMMISSIONINGS, is_resumed)
-        request = make_manifest(measured.data, DECISIVE)
-        keep_request(out / COMMISSIONINGS.mark, request, ("spec", "code"), "file or program")
+        request = make_manifest(measured.data, DECISIVE) | {"files": measured.data_files()}
+        checked = "spec", "code", "files"
+        keep_request(out / COMMISSIONINGS.mark, request, checked, "file, data or program")
         outcome = _outcome(measured, out, console)
         with publish(out) as staging:
             (staging / DOCUMENT).write_text(document(measured, outcome), encoding="utf-8")
@@ -102,7 +106,7 @@ def _run(stage: Stage, measured: MeasuredSpec, out: Path, console: Console) -> s
     """Do a stage unless it is done; what it refuses, "" if nothing."""
     number = f"stage {STAGES.index(stage) + 1} of {len(STAGES)}, {stage.name}"
     if stage.is_done(out):
-        console.print(f"{number}: done before")
+        console.print(f"{number}: already computed")
         return ""
     console.print(f"{number}: {stage.text}")
     try:

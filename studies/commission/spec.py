@@ -6,6 +6,7 @@ differs from the default; its machines are those of the fit. `[commission]` is d
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,11 +17,12 @@ from studies.errors import StudyError, field_error, nearest
 from studies.export.firmware.boards import BOARDS
 from studies.export.run import DAC_BITS
 from studies.export.targets import TARGETS
-from studies.fitting.spec import FitSpec, parse_fit
+from studies.fitting.spec import FileEntry, FitSpec, parse_fit
 from studies.laws.candidates import RATIOS, law_candidate
 from studies.study.explain import explain
 from studies.study.files import find_spec, read_toml
 from studies.study.spec import Section, Study, described
+from studies.tuning.spec import parse_tuning
 
 #: Its section.
 SECTION = "commission"
@@ -51,6 +53,19 @@ class MeasuredSpec(NamedTuple):
     tune: dict[str, Any]  # section [tune] as written
     commission: Commission
     data: dict[str, Any]  # the whole file
+
+    def data_files(self) -> dict[str, str]:
+        """Digests of the files with the measured data, by name; "" of those that are not there."""
+        names = {
+            entry.file.partition("::")[0]
+            for entry in self.fit.entries
+            if isinstance(entry, FileEntry)
+        }
+        paths = {name: self.fit.folder / name for name in sorted(names)}
+        return {
+            name: hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+            for name, path in paths.items()
+        }
 
     @property
     def study(self) -> Study:
@@ -96,7 +111,10 @@ def parse_measured(data: dict[str, Any], folder: str | Path = ".") -> MeasuredSp
         raise field_error("tune", tune, "a section, as of studies tune")
     if "machines" in tune.get("scenarios", {}):
         raise StudyError("tune.scenarios.machines: not allowed here; they are those of the fit")
-    return MeasuredSpec(fit=fit, tune=tune, commission=commission, data=data)
+    measured = MeasuredSpec(fit=fit, tune=tune, commission=commission, data=data)
+    # what a tuning refuses is said before anything is fitted
+    parse_tuning(fit.study.model_dump() | {"tune": tuning_section(measured, fit.study, {})})
+    return measured
 
 
 def _check_name(field: str, value: str, allowed: list[str]) -> None:
