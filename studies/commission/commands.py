@@ -29,7 +29,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
         Ends with 1 and says why if the data do not support a controller.
         """
-        from studies.engine.folder import COMMISSIONINGS, refuse_existing
+        from studies.engine.folder import COMMISSIONINGS, refuse_existing, resumable
 
         refuse_existing(out, COMMISSIONINGS, resume)
         start()
@@ -37,12 +37,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.commission.spec import load_measured
 
         spec = load_measured(measured)
-        try:
+        with resumable(out):
             made = run_commission(spec, out, resume, console)
-        except KeyboardInterrupt:
-            if out.exists():
-                text = f"studies: finished work is safe; continue with --resume --out {out}"
-                print(text, file=sys.stderr)
-            raise
         if not made.is_good:
             sys.exit(1)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -61,9 +60,7 @@ def unknown_to_controller(possible: Possible, study: Study) -> dict[str, list[fl
     return columns
 
 
-def margins_on(
-    possible: Possible, study: Study, say: Callable[[int, int], Any] = lambda done, total: None
-) -> np.ndarray:
+def margins_on(possible: Possible, study: Study) -> np.ndarray:
     """Gain margin of a study's fixed controller on every machine [1], 0 where it has no loop, (n,).
 
     With at least `studies.study.margin.MARGIN_MODES` modes a link.
@@ -71,12 +68,10 @@ def margins_on(
     Args:
         possible: the machines.
         study: of the controller.
-        say: called with how many are done.
     """
     law = jax.tree.map(jnp.asarray, fixed_controller(study).controller)
     home, margins = np.array(study.motion.waypoints[0], float), np.zeros(len(possible.values))
     for k in range(len(margins)):
-        say(k, len(margins))
         try:
             machine = possible.machine(study, k)
             structure = build_structure(machine)._replace(has_position_gain=False)

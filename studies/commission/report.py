@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from studies.commission.spec import MeasuredSpec
+from studies.commission.stages import STAGES
 from studies.fitting.spec import number_unit
-from studies.publish import REPORT
 from studies.show.document import json_text
 from studies.show.pages import page
 from studies.study.margin import margin_text
@@ -112,16 +112,7 @@ def report(measured: MeasuredSpec, outcome: CommissionFindings) -> str:
         measured: what was asked for.
         outcome: how far it went.
     """
-    stages = [
-        (name, f"{name}/{file}")
-        for name, file in (
-            ("fit", REPORT),
-            ("tune", REPORT),
-            ("certificate", REPORT),
-            ("firmware", "verification.html"),
-        )
-        if (outcome.out / name / file).is_file()
-    ]
+    pages = [f"{stage.name}/{stage.page}" for stage in STAGES]
     return page(
         "commission/report.html",
         None,
@@ -130,7 +121,7 @@ def report(measured: MeasuredSpec, outcome: CommissionFindings) -> str:
         measured=measured,
         wanted=measured.commission,
         lines=summary(outcome),
-        stages=stages,
+        pages=[file for file in pages if (outcome.out / file).is_file()],
         rows=_numbers(outcome),
         margins=_margins(outcome),
     )

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -122,36 +123,57 @@ def _judged(
     outcome: CommissionFindings, stage: Stage, fault: str, measured: MeasuredSpec, console: Console
 ) -> CommissionFindings:
     """The outcome with a stage's answer, and with what speaks against going on."""
-    out, wanted = outcome.out, measured.commission.gain_margin
-    refusals = [f"{stage.name}: {fault}"] if fault else []
-    if stage.name == "fit":
-        fit = fit_document(out)
-        outcome = outcome._replace(fit=fit)
-        refusals += _unsupported(fit)
-    elif stage.name == "tune" and not fault:
-        margins = _margins(out, console)
-        outcome = outcome._replace(tuned=tuned_design(out).study, margins=margins)
-        low = int(np.sum(margins < wanted))
-        if low:
-            refusals.append(
-                f"on {low} of {len(margins)} machines that the data leave possible the gain margin "
-                f"is below {wanted:g}, down to {margins.min():.3g}"
-            )
-    elif stage.name == "certificate" and not fault:
-        certificate = certificate_document(out)
-        outcome = outcome._replace(certificate=certificate)
-        if not certificate["is_passed"]:
-            refusals.append(f"certificate {certificate['verdict']}")
-    elif stage.name == "firmware" and not fault and not is_verified(out):
-        refusals.append("the exported code does not behave as the controller that was designed")
-    return outcome._replace(done=stage.name, refusals=tuple(refusals))
+    outcome = outcome._replace(done=stage.name)
+    if fault:
+        return outcome._replace(refusals=(f"{stage.name}: {fault}",))
+    return _JUDGES[stage.name](outcome, measured.commission.gain_margin, console)
 
 
-def _unsupported(fit: dict) -> list[str]:  # type: ignore[type-arg]
-    """Why a fit is no ground for a design, from its messages."""
-    if not fit["is_explained"] or not fit["is_converged"]:
-        return [str(text) for text in fit["messages"][:3]]
-    return []
+def _judge_fit(outcome: CommissionFindings, wanted: float, console: Console) -> CommissionFindings:
+    """Its gravest messages, if it is no ground for a design."""
+    fit = fit_document(outcome.out)
+    is_ground = fit["is_explained"] and fit["is_converged"]
+    texts = () if is_ground else tuple(str(text) for text in fit["messages"][:3])
+    return outcome._replace(fit=fit, refusals=texts)
+
+
+def _judge_tuned(
+    outcome: CommissionFindings, wanted: float, console: Console
+) -> CommissionFindings:
+    """The gain margins of its controller on all possible machines."""
+    margins = _margins(outcome.out, console)
+    outcome = outcome._replace(tuned=tuned_design(outcome.out).study, margins=margins)
+    low = int(np.sum(margins < wanted))
+    text = (
+        f"on {low} of {len(margins)} machines that the data leave possible the gain margin "
+        f"is below {wanted:g}, down to {margins.min():.3g}"
+    )
+    return outcome._replace(refusals=(text,) if low else ())
+
+
+def _judge_certificate(
+    outcome: CommissionFindings, wanted: float, console: Console
+) -> CommissionFindings:
+    certificate = certificate_document(outcome.out)
+    text = f"certificate {certificate['verdict']}"
+    refusals = () if certificate["is_passed"] else (text,)
+    return outcome._replace(certificate=certificate, refusals=refusals)
+
+
+def _judge_firmware(
+    outcome: CommissionFindings, wanted: float, console: Console
+) -> CommissionFindings:
+    text = "the exported code does not behave as the controller that was designed"
+    return outcome._replace(refusals=() if is_verified(outcome.out) else (text,))
+
+
+#: By name of the stage: its answer, of the outcome so far and the least gain margin.
+_JUDGES: dict[str, Callable[[CommissionFindings, float, Console], CommissionFindings]] = {
+    "fit": _judge_fit,
+    "tune": _judge_tuned,
+    "certificate": _judge_certificate,
+    "firmware": _judge_firmware,
+}
 
 
 def _margins(out: Path, console: Console) -> np.ndarray:

@@ -134,10 +134,8 @@ def tuning_section(
         machines: that the data leave possible, by field.
     """
     written = measured.tune
-    own = law_candidate(study, LAWS[study.control.law])
-    free = {name: x for name, x in own.free.items() if not name.startswith(RATIOS)}
     default = {
-        "free": free,
+        "free": written["free"] if "free" in written else _own_free(study),
         "objective": {"residual_rms": 1.0},
         "starts": STARTS,
         "iterations": ITERATIONS,
@@ -150,3 +148,9 @@ def tuning_section(
     else:
         scenarios["count"] = 1
     return default | written | {"limits": limits, "scenarios": scenarios}
+
+
+def _own_free(study: Study) -> dict[str, Any]:
+    """The gain and the filters of a study's law, as [tune.free]."""
+    own = law_candidate(study, LAWS[study.control.law])
+    return {name: x for name, x in own.free.items() if not name.startswith(RATIOS)}

@@ -31,6 +31,7 @@ class Stage(NamedTuple):
 
     name: str  # of its folder
     text: str
+    page: str  # its report
     last: tuple[str, ...]  # files of which one is written at its end
     make: Callable[[MeasuredSpec, Path, Console], None]  # in the folder of all stages
 
@@ -73,10 +74,34 @@ def _export(measured: MeasuredSpec, out: Path, console: Console) -> None:
 
 #: In their order.
 STAGES = (
-    Stage("fit", "fit the model to the measurements", (DOCUMENT,), _fit),
-    Stage("tune", "tune on machines that the data leave possible", (REPORT,), _tune),
-    Stage("certificate", "certify on plants that differ from the model", (CERTIFICATE,), _certify),
-    Stage("firmware", "export, compare, emulate", (VERIFICATION, FAILED), _export),
+    Stage(
+        name="fit",
+        text="fit the model to the measurements",
+        page=REPORT,
+        last=(DOCUMENT,),
+        make=_fit,
+    ),
+    Stage(
+        name="tune",
+        text="tune on machines that the data leave possible",
+        page=REPORT,
+        last=(REPORT,),
+        make=_tune,
+    ),
+    Stage(
+        name="certificate",
+        text="certify on plants that differ from the model",
+        page=REPORT,
+        last=(CERTIFICATE,),
+        make=_certify,
+    ),
+    Stage(
+        name="firmware",
+        text="export, compare, emulate",
+        page=VERIFICATION,
+        last=(VERIFICATION, FAILED),
+        make=_export,
+    ),
 )
 
 

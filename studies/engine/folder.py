@@ -13,6 +13,7 @@ import json
 import os
 import re
 import subprocess
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from hashlib import file_digest
@@ -64,14 +65,10 @@ SWEEPS = Content(
 )
 TUNINGS = Content("a tuning", TUNING, re.compile(r"\..+\.[0-9a-f]{8}\.tmp"))
 ATLASES = Content("an atlas", "runs", re.compile(r"\.unfinished-.*"))
-COMPARISONS = Content(
-    "a comparison of laws", "request.json", re.compile(r"\.unfinished-.*|\..+\.[0-9a-f]{8}\.tmp")
-)
-
-
-COMMISSIONINGS = Content(
-    "a commissioning", "request.json", re.compile(r"\.unfinished-.*|\..+\.[0-9a-f]{8}\.tmp")
-)
+#: Of a folder with a request and folders of its own in it.
+_UNFINISHED = re.compile(r"\.unfinished-.*|\..+\.[0-9a-f]{8}\.tmp")
+COMPARISONS = Content("a comparison of laws", "request.json", _UNFINISHED)
+COMMISSIONINGS = Content("a commissioning", "request.json", _UNFINISHED)
 
 
 class Finished(NamedTuple):
@@ -280,6 +277,18 @@ def keep_request(file: Path, request: dict[str, Any], checked: Iterable[str], wh
         return
     with replacing(file) as temporary:
         temporary.write_text(json.dumps(request, indent=1), encoding="utf-8")
+
+
+@contextmanager
+def resumable(out: Path) -> Iterator[None]:
+    """Say after Ctrl-C how work in a folder goes on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if out.exists():
+            text = f"studies: finished work is safe; continue with --resume --out {out}"
+            print(text, file=sys.stderr)
+        raise
 
 
 def read_manifest(path: Path) -> dict[str, Any]:

@@ -22,7 +22,6 @@ from studies.export.c_text import Source
 from studies.export.cost import cost_of
 from studies.export.document import document, schema, to_json
 from studies.export.firmware.on_target import Comparison, verify_on_target
-from studies.export.firmware.project import project_files
 from studies.export.fixed import FixedPoint, Wires, check_words, design_fixed, rounded
 from studies.export.fixed_blocks import FixedBlocks, design_blocks, rounded_blocks
 from studies.export.floating import BlockSignals, Signals, respond
@@ -113,7 +112,7 @@ def _on_target(job: Job, result: ExportResult, source: Source, wires: Wires | No
     verified = result.verified
     runs = verified.runs if found.run is None else verified.runs | {job.board.text: found.run}
     return result._replace(
-        files=result.files | project_files(source, job.name, job.board, wires is not None),
+        files=result.files | found.files,
         verified=verified._replace(checks=[*verified.checks, *found.checks], runs=runs),
         on_target=found,
     )

@@ -17,7 +17,7 @@ from studies.export.c_drive import DriveCode, compare_drive
 from studies.export.c_text import Source
 from studies.export.compiler import Code, Responding, compiled
 from studies.export.document import Document, controller_of
-from studies.export.fixed import FixedPoint, rail_samples, shaper_row
+from studies.export.fixed import FixedPoint, Wires, rail_samples, shaper_row
 from studies.export.fixed_blocks import FixedBlocks
 from studies.export.floating import BlockSignals
 from studies.export.floating import respond as respond_floating
@@ -145,10 +145,8 @@ def verify_floating(
             largest = _largest_demand(exported, codes)
             check = compare_values(f"open loop, {label}", volts, expected, DOUBLE, largest)
             checks.append(check._replace(is_met=check.is_met and not faults.any()))
-        top = float(exported.controller.adc_top + 3)
-        bad = {"beyond the range": top, "NaN": np.nan, "infinite": np.inf}
         step = float(exported.controller.adc_step)
-        checks += check_faults(exported, code, reference, bad, step, 0.0)
+        checks += check_faults(exported, code, reference, None)
         path, shaped = reference_path(exported)
         checks.append(compare_values("shaper, the case's motion", code.shape(path), shaped, DOUBLE))
         shape = reference.codes.shape[1:]
@@ -160,7 +158,7 @@ def verify_floating(
         )
     with load_code(exported, source, name, compiler, np.float32, np.float32) as code:
         volts, _ = code.respond(reference.codes * step)
-        checks += check_faults(exported, code, reference, bad, step, 0.0, ", float")
+        checks += check_faults(exported, code, reference, None, ", float")
         single = compare_values("", volts, reference.voltage, SINGLE)
         advice = "precise enough" if single.is_met else "NOT precise enough, keep to double"
         note = f"With float, recorded codes in open loop differ by {single.found}: {advice}."
@@ -217,13 +215,7 @@ def verify_fixed(
                     differing == 0,
                 )
             )
-        # a 16-bit word cannot exceed the highest code of such an ADC
-        bad = (
-            {"beyond the range": fixed.wires.adc_top + 1.0}
-            if fixed.wires.adc_top < 2**16 - 1
-            else {}
-        )
-        checks += check_faults(exported, code, reference, bad, 1.0, float(fixed.wires.dac_rest))
+        checks += check_faults(exported, code, reference, fixed.wires)
         checks.append(_check_shaper(exported, code))
     checks.append(_check_error(exported, fixed, reference, counts["recorded codes"]))
     for label in ("recorded codes", "own run in the loop"):
@@ -333,9 +325,7 @@ def check_faults(
     exported: FixedController,
     code: Responding,
     reference: LoopRun,
-    bad: dict[str, float],
-    scale: float,
-    rest: float,
+    wires: Wires | None,
     note: str = "",
 ) -> list[Check]:
     """Check that a faulty sensor is reported and all actuators rest from then on.
@@ -344,16 +334,20 @@ def check_faults(
         exported: the controller.
         code: the same in C.
         reference: its run.
-        bad: codes that are faulty immediately, by name.
-        scale: the code's value of one ADC code.
-        rest: an actuator's value at rest.
+        wires: of code in fixed point; None: it is in floating point.
         note: for the names of the checks.
     """
     link, top = int(exported.channels.link[-1]), float(exported.controller.adc_top)
     rail = rail_samples(exported.study.electronics.sample_rate_hz)
     number, begin = link * exported.n_patches + 1, len(reference.codes) // 3
     faults = {"stuck at the end of the range": (top, rail)}
-    faults |= {name: (value, 1) for name, value in bad.items()}
+    if wires is None:
+        scale, rest = float(exported.controller.adc_step), 0.0
+        faults |= {"beyond the range": (top + 3, 1), "NaN": (np.nan, 1), "infinite": (np.inf, 1)}
+    else:
+        scale, rest = 1.0, float(wires.dac_rest)
+        if top < 2**16 - 1:  # a 16-bit word can exceed it
+            faults["beyond the range"] = (top + 1, 1)
     checks = []
     for name, (value, needed) in faults.items():
         codes = np.clip(reference.codes[: begin + rail + 50], 1, top - 1)

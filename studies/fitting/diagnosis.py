@@ -18,10 +18,11 @@ from studies.errors import StudyError
 from studies.fitting.kinds.contract import Measurement
 from studies.fitting.kinds.response import ComplexResponse
 from studies.fitting.measurements import make_bench, make_measurements
-from studies.fitting.problem import Problem
+from studies.fitting.problem import Problem, make_problem
 from studies.fitting.solve import descend_all, follow
 from studies.fitting.spec import FitSpec, number_unit, parse_fit
 from studies.fitting.statistics import misfit
+from studies.space.free import plain_numbers
 from studies.study.paths import free_fields, known_field, parts_of
 from studies.study.signals import Signal
 from studies.study.spec import DESIGN, MACHINE
@@ -255,7 +256,7 @@ def _of_fields(spec: FitSpec, problem: Problem, u: np.ndarray) -> list[Remedy]:
         return []
     count = len(spec.free.numbers)
     try:
-        wide, at = _wide_problem(whole, problem, u)
+        wide, at = _wide_problem(whole, u)
         falls = _falls(wide.residual(at), wide.jacobian(at), count)
     except (StudyError, np.linalg.LinAlgError):
         return []
@@ -300,9 +301,8 @@ def _freed(spec: FitSpec) -> FitSpec | None:
         bounds = _bounds(spec, field)
         if bounds is None:
             continue
-        trial = spec.data | {"fit": spec.data["fit"] | {"free": {field: bounds}}}
         try:
-            parse_fit(trial, spec.folder)
+            plain_numbers(field, bounds, spec.study, "fit.free", (DESIGN, MACHINE))
         except StudyError:  # it has no such range
             continue
         more[field] = bounds
@@ -328,20 +328,13 @@ def _bounds(spec: FitSpec, field: str) -> dict[str, Any] | None:
     return None
 
 
-def _wide_problem(whole: FitSpec, problem: Problem, u: np.ndarray) -> tuple[Problem, np.ndarray]:
+def _wide_problem(whole: FitSpec, u: np.ndarray) -> tuple[Problem, np.ndarray]:
     """The problem with more free numbers, and the place in it where the fit ended."""
     bench = make_bench(whole)
-    measured = [x for x in make_measurements(whole, bench) if not x.is_checked]
-    wide = Problem(
-        free=whole.free,
-        priors=whole.priors,
-        measurements=tuple(measured),
-        bench=bench,
-        is_robust=problem.is_robust,
-    )
+    wide = make_problem(whole, bench, make_measurements(whole, bench))
     at = whole.free.places()
     at[: len(u)] = u
     values = whole.free.values(at)
-    for one in measured:
+    for one in wide.measurements:
         one.reweigh(values)
     return wide, np.clip(at, 1e-9, 1 - 1e-9)

@@ -16,7 +16,7 @@ from studies.fitting.experiment import Experiment, next_experiments
 from studies.fitting.kinds.contract import DataAndModel, Measurement
 from studies.fitting.measurements import guess, make_bench, make_measurements
 from studies.fitting.posterior import Posterior, load_blackjax, sample, shape
-from studies.fitting.problem import Problem, check_sanity
+from studies.fitting.problem import Problem, check_sanity, make_problem
 from studies.fitting.profiles import Likelihood, describe_confirmed
 from studies.fitting.solve import Optimum, Solution, solve
 from studies.fitting.spec import FitSpec
@@ -99,15 +99,9 @@ def estimate(spec: FitSpec, phases: Phases | None = None) -> Fitted:
     phases.begin("fit")
     bench = make_bench(spec)
     every = make_measurements(spec, bench)
-    kept = tuple(x for x in every if not x.is_checked)
+    problem = make_problem(spec, bench, every)
+    kept = problem.measurements
     check_sanity(kept, guess(spec))
-    problem = Problem(
-        free=spec.free,
-        priors=spec.priors,
-        measurements=kept,
-        bench=bench,
-        is_robust=fit.loss == "robust",
-    )
     _check(problem, phases, fit.starts)
     solution = solve(problem, fit.starts, fit.refine, fit.iterations, fit.seed)
     phases.begin("profile", "the likelihood")

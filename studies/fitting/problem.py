@@ -10,7 +10,7 @@ import numpy as np
 from studies.errors import StudyError
 from studies.fitting.bench import Bench
 from studies.fitting.kinds.contract import Measurement, Residual
-from studies.fitting.spec import Prior
+from studies.fitting.spec import FitSpec, Prior
 from studies.space.free import FreeNumbers
 
 #: Size of a residual from which the robust loss grows linearly, in standard deviations.
@@ -80,6 +80,23 @@ class Problem(NamedTuple):
                 cost = np.inf
             costs.append(cost if np.isfinite(cost) else np.inf)
         return np.array(costs)
+
+
+def make_problem(spec: FitSpec, bench: Bench, measurements: Sequence[Measurement]) -> Problem:
+    """The problem of a fit.
+
+    Args:
+        spec: of the fit.
+        bench: its linear machine.
+        measurements: all of them; those held out are left out.
+    """
+    return Problem(
+        free=spec.free,
+        priors=spec.priors,
+        measurements=tuple(x for x in measurements if not x.is_checked),
+        bench=bench,
+        is_robust=spec.fit.loss == "robust",
+    )
 
 
 def softened(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -40,7 +39,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
         Takes about 20 minutes on two cores; --resume continues an interrupted comparison.
         """
-        from studies.engine.folder import COMPARISONS, refuse_existing
+        from studies.engine.folder import COMPARISONS, refuse_existing, resumable
 
         refuse_existing(out, COMPARISONS, resume)
         start()
@@ -48,11 +47,6 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.laws.run import run_laws
 
         study = load_design(design, case).study
-        try:
+        with resumable(out):
             run_laws(study, out, voltage, margin, resume, console, quiet)
-        except KeyboardInterrupt:
-            if out.exists():
-                text = f"studies: finished work is safe; continue with --resume --out {out}"
-                print(text, file=sys.stderr)
-            raise
         announce(console, out / REPORT)

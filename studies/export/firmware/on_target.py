@@ -40,6 +40,7 @@ class OnTarget(NamedTuple):
     """A controller on an emulated processor."""
 
     board: Board
+    files: dict[str, str]  # of the project
     checks: list[Check]
     built: Built
     sizes: ProgramSizes | None  # None: the program does not run
@@ -69,6 +70,11 @@ class Comparison(NamedTuple):
         return self.wires is not None
 
     @property
+    def limit(self) -> float:
+        """Largest difference of floating point over the largest value [1]."""
+        return SINGLE if self.board.real == "float" else DOUBLE
+
+    @property
     def label(self) -> str:
         """The run in the loop on this machine that the target repeats."""
         return "C, fixed point" if self.is_fixed else "JAX"
@@ -89,6 +95,7 @@ def verify_on_target(at: Comparison) -> OnTarget:
         built = build(Path(folder), at.name, at.board, at.is_fixed)
         found = OnTarget(
             board=at.board,
+            files=files,
             checks=_static_checks(at, built),
             built=built,
             sizes=None,
@@ -128,7 +135,8 @@ def _compared(at: Comparison, found: OnTarget, processor: EmulatedCode) -> OnTar
         counts[label] = processor.instructions[-1]
         checks.append(_compare(at, label, values, exchange.actuator))
     checks += _compare_here(at, processor, counts)
-    checks += _faults(at, processor)
+    reference, note = at.verified.runs["JAX"], f", {at.board.name}"
+    checks += check_faults(at.exported, processor, reference, at.wires, note)
     run = _closed_loop(at, processor, counts)
     checks += _loop_checks(at, run)
     return found._replace(
@@ -146,8 +154,7 @@ def _compare(at: Comparison, label: str, values: np.ndarray, wanted: np.ndarray)
         differing = int(np.sum(values != wanted))
         text = f"{differing} of {values.size} codes differ"
         return Check(what, text, "0", differing == 0)
-    limit = SINGLE if at.board.real == "float" else DOUBLE
-    return compare_values(what, values, wanted, limit)
+    return compare_values(what, values, wanted, at.limit)
 
 
 def _compare_here(
@@ -160,8 +167,7 @@ def _compare_here(
     what = f"{at.board.name}: shaper, the case's motion"
     with load_code(at.exported, at.source, at.name, at.compiler, wire, word) as code:
         if not at.is_fixed:
-            limit = SINGLE if at.board.real == "float" else DOUBLE
-            return [compare_values(what, processor.shape(path), code.shape(path), limit)]
+            return [compare_values(what, processor.shape(path), code.shape(path), at.limit)]
         rows, _ = path_counts(path)
         differing = int(np.sum(processor.shape(rows) != code.shape(rows)))
         shaper = Check(what, f"{differing} counts differ", "0", differing == 0)
@@ -192,19 +198,6 @@ def _compare_episodes(
         "0",
         differing == 0,
     )
-
-
-def _faults(at: Comparison, processor: EmulatedCode) -> list[Check]:
-    controller = at.exported.controller
-    reference, top = at.verified.runs["JAX"], float(controller.adc_top)
-    if at.wires is not None:
-        bad = {"beyond the range": top + 1} if top < 2**16 - 1 else {}
-        scale, rest = 1.0, float(at.wires.dac_rest)
-    else:
-        bad = {"beyond the range": top + 3, "NaN": np.nan, "infinite": np.inf}
-        scale, rest = float(controller.adc_step), 0.0
-    note = f", {at.board.name}"
-    return check_faults(at.exported, processor, reference, bad, scale, rest, note)
 
 
 def _closed_loop(at: Comparison, processor: EmulatedCode, counts: dict[str, np.ndarray]) -> LoopRun:
