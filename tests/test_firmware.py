@@ -22,6 +22,7 @@ from studies.export.firmware.build import (
 )
 from studies.export.firmware.emulator import emulated
 from studies.export.firmware.project import project_files, write_files
+from studies.export.verify import Exchange
 from tests.exports import DESIGNS, needs_compiler, needs_cpp, write_study
 from tests.pages import tables_of, text_of
 from tests.test_cli import refused, run
@@ -71,6 +72,16 @@ edge: { sourcename: "flexlink_init" targetname: "flexlink.c:forget" }
 def test_the_stack_is_that_of_the_deepest_calls():
     assert stack_bound(GRAPH, "flexlink_step") == 136 + 16 + 24
     assert stack_bound(GRAPH, "flexlink_init") == 8 + 24
+
+
+def test_demands_far_above_the_limit_count_as_rounded():
+    """What an observer that is told of limits rounds is a share of its demands."""
+    volts = np.full((4, 3, 3), 100.0)
+    at = on_target.Comparison(None, None, "", BOARDS["cortex-m4f"], None, [], None)
+    for largest, is_met in ((0.0, False), (1e4, True)):
+        exchange = Exchange(volts, volts, largest)
+        check = on_target._compare(at, "random", volts + 1.0, exchange)
+        assert check.is_met == is_met
 
 
 @pytest.mark.parametrize(

@@ -62,6 +62,7 @@ class Exchange(NamedTuple):
 
     sensor: np.ndarray  # (T, 3, K)
     actuator: np.ndarray  # (T, 3, K)
+    largest: float = 0.0  # voltage that the arithmetic rounds, where it exceeds them [V]
 
 
 class Verification(NamedTuple):
@@ -140,9 +141,9 @@ def verify_floating(
         sequences = {"recorded codes": reference.codes, **_hard_codes(exported, reference)}
         for label, codes in sequences.items():
             sensor, expected = codes * float(exported.controller.adc_step), _replay(exported, codes)
-            exchanges[label] = Exchange(sensor, expected)
-            volts, faults = code.respond(sensor)
             largest = _largest_demand(exported, codes)
+            exchanges[label] = Exchange(sensor, expected, largest)
+            volts, faults = code.respond(sensor)
             check = compare_values(f"open loop, {label}", volts, expected, DOUBLE, largest)
             checks.append(check._replace(is_met=check.is_met and not faults.any()))
         step = float(exported.controller.adc_step)

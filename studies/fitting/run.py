@@ -51,29 +51,23 @@ def run_fit(
     with Phases(console, fit_phases(spec)) as phases, serial_blas():
         fitted = estimate(spec, phases)
         phases.begin("draw")
-        with publish(
-            out, [f"{x}.{kind}" for x in plots.NAMES for kind in ("png", "pdf")]
-        ) as staging:
+        images = [f"{x}.{kind}" for x in plots.NAMES for kind in ("png", "pdf")]
+        with publish(out, [DOCUMENT, *images]) as staging:
             with figures.styled():
                 for name, figure in plots.all_figures(fitted):
                     figures.save(figure, staging, name, has_pdf)
             (staging / STUDY).write_text(study_template(fitted.study), encoding="utf-8")
             (staging / TUNE).write_text(_tuning(fitted), encoding="utf-8")
             write_store(staging / DATA, variables(fitted), run_attributes(fitted.study))
-            _present(staging, staging, fitted)
+            (staging / REPORT).write_text(report(fitted, staging), encoding="utf-8")
         fitted = suggest(fitted, phases)
-        with publish(out) as staging:
-            _present(staging, out, fitted)
+        with publish(out) as staging:  # only now is there a document: the answer is complete
+            (staging / REPORT).write_text(report(fitted, out), encoding="utf-8")
+            (staging / DOCUMENT).write_text(document(fitted), encoding="utf-8")
     console.print(summary(fitted), soft_wrap=True)
     more = f"; {STUDY} is the fitted study, {TUNE} a tuning for machines like it"
     announce(console, out / REPORT, more)
     return fitted
-
-
-def _present(folder: Path, images: Path, fitted: Fitted) -> None:
-    """Write the answer in words; `images`: folder with its figures."""
-    (folder / DOCUMENT).write_text(document(fitted), encoding="utf-8")
-    (folder / REPORT).write_text(report(fitted, images), encoding="utf-8")
 
 
 def machines(fitted: Fitted) -> dict[str, list[float]]:

@@ -23,6 +23,7 @@ from studies.export.verify import (
     DOUBLE,
     SINGLE,
     Check,
+    Exchange,
     Verification,
     check_faults,
     compare_values,
@@ -133,7 +134,7 @@ def _compared(at: Comparison, found: OnTarget, processor: EmulatedCode) -> OnTar
     for label, exchange in at.verified.exchanges.items():
         values, _ = processor.respond(exchange.sensor)
         counts[label] = processor.instructions[-1]
-        checks.append(_compare(at, label, values, exchange.actuator))
+        checks.append(_compare(at, label, values, exchange))
     checks += _compare_here(at, processor, counts)
     reference, note = at.verified.runs["JAX"], f", {at.board.name}"
     checks += check_faults(at.exported, processor, reference, at.wires, note)
@@ -148,13 +149,14 @@ def _compared(at: Comparison, found: OnTarget, processor: EmulatedCode) -> OnTar
     )
 
 
-def _compare(at: Comparison, label: str, values: np.ndarray, wanted: np.ndarray) -> Check:
+def _compare(at: Comparison, label: str, values: np.ndarray, exchange: Exchange) -> Check:
+    wanted = exchange.actuator
     what = f"{at.board.name}: {label}"
     if at.is_fixed:
         differing = int(np.sum(values != wanted))
         text = f"{differing} of {values.size} codes differ"
         return Check(what, text, "0", differing == 0)
-    return compare_values(what, values, wanted, at.limit)
+    return compare_values(what, values, wanted, at.limit, exchange.largest)
 
 
 def _compare_here(
