@@ -1,10 +1,23 @@
-"""Measurements of machines drawn at random, made by a richer model than the one to be fitted."""
+"""Machines drawn at random, richer than the model that is fitted, and how firmware does on them."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from studies.commission.spec import tuning_section
+from studies.engine.controller import fixed_controller
+from studies.engine.design import load_design
+from studies.engine.fast_motion import find_motion, with_own_motion
+from studies.engine.stability import loop_report
+from studies.export.in_the_loop import run_controller
+from studies.export.run import DAC_BITS
 from studies.fitting.measurements import make_bench, make_measurements
 from studies.fitting.spec import parse_fit
+from studies.study.cases import build_case, build_structure
 from studies.study.spec import paper_study, parse_study
+from studies.tuning.run import run_tuning
+from studies.tuning.spec import parse_tuning
+from tests.elements import response_of_elements
 from tests.fits import write
 
 POSE = [0.005, 0.012, 0.48]
@@ -19,7 +32,8 @@ FREE = {
     "link.damping_ratio": {"from": 0.002, "to": 0.05, "scale": "log"},
     "load.mass": {"from": 0.0, "to": 0.4},
     "drive.kp": {"from": 1e4, "to": 1e6, "scale": "log"},
-    "drive.kd": {"from": 10.0, "to": 6000.0, "scale": "log"},
+    "drive.kd": {"from": 40.0, "to": 90.0},
+    "drive.coulomb_friction": {"from": 0.0, "to": 2.0},
 }
 
 
@@ -68,16 +82,20 @@ def responses():
     ]
 
 
-def measure(folder, true, seed, delay=0.0):
-    """Write responses of a machine, with noise; their entries. delay: of all of them [s]."""
-    entries, one = responses(), np.ones(len(FREQUENCY))
-    for entry in entries:
-        write(folder, entry["file"], frequency_hz=FREQUENCY, real=one, imag=one)
-    start = {"link.damping_ratio": {"from": 1e-4, "to": 0.1}}
-    spec = parse_fit(true.model_dump() | {"fit": {"free": start, "data": entries}}, folder)
-    rng, values = np.random.default_rng(seed), np.array([true.link.damping_ratio])
-    for entry, one in zip(entries, make_measurements(spec, make_bench(spec)), strict=True):
-        exact, _ = one.predict(values, False)
+def measure(folder, true, seed, delay=0.0, is_elements=False):
+    """Write responses of a machine, with noise; their entries.
+
+    Args:
+        folder: for the files.
+        true: the machine.
+        seed: of the noise.
+        delay: of all responses [s].
+        is_elements: whether they are those of finite elements.
+    """
+    entries = responses()
+    made = _by_elements(true, entries) if is_elements else _by_model(folder, true, entries)
+    rng = np.random.default_rng(seed)
+    for entry, exact in zip(entries, made, strict=True):
         exact = exact * np.exp(-2j * np.pi * FREQUENCY * delay)
         floor = FLOOR * np.abs(exact).max()
         sigma = np.hypot(NOISE * np.abs(exact), floor)
@@ -87,11 +105,63 @@ def measure(folder, true, seed, delay=0.0):
     return entries
 
 
-def measured_data(folder, seed, **commission):
+def _by_model(folder, true, entries):
+    """Exact responses by our own model, (n, f)."""
+    one = np.ones(len(FREQUENCY))
+    for entry in entries:
+        write(folder, entry["file"], frequency_hz=FREQUENCY, real=one, imag=one)
+    start = {"link.damping_ratio": {"from": 1e-4, "to": 0.1}}
+    spec = parse_fit(true.model_dump() | {"fit": {"free": start, "data": entries}}, folder)
+    values = np.array([true.link.damping_ratio])
+    return [one.predict(values, False)[0] for one in make_measurements(spec, make_bench(spec))]
+
+
+def _by_elements(true, entries):
+    """The same by finite elements."""
+    patches = [
+        [tuple(int(x) - 1 for x in entry[end].split()[1].split(".")) for end in ("input", "output")]
+        for entry in entries
+    ]
+    return response_of_elements(true, POSE, patches, FREQUENCY)
+
+
+def measured_data(folder, seed, is_elements=False, **commission):
     """The file of a commissioning as a dictionary, and the machine that was measured."""
     true = true_study(seed)
-    entries = measure(folder, true, seed)
+    entries = measure(folder, true, seed, is_elements=is_elements)
     data = assumed_study().model_dump()
     data |= {"fit": {"free": FREE, "data": entries}, "commission": commission}
     parse_study({k: x for k, x in data.items() if k not in ("fit", "commission")})
     return data, true
+
+
+def with_control_of(true, tuned):
+    """The true machine with everything else of a tuned study."""
+    return tuned.model_copy(update={x: getattr(true, x) for x in ("link", "load", "drive")})
+
+
+def margin_on(true, tuned):
+    """Gain margin [1] of a tuned study's fixed controller on the true machine; 0: unstable."""
+    both, law = with_control_of(true, tuned), fixed_controller(tuned).controller
+    structure = build_structure(both)._replace(has_position_gain=False)
+    home = np.array(both.motion.waypoints[0], float)
+    law = jax.tree.map(jnp.asarray, law)
+    loop = loop_report(structure, build_case(both), home, 1, law=law)
+    return float(loop.gain_margin) if loop.is_stable else 0.0
+
+
+def residual_on(true, tuned):
+    """Residual vibration [m] of the worst link with that controller behind the same DAC."""
+    both, fixed = with_control_of(true, tuned), fixed_controller(tuned)
+    step = float(fixed.controller.voltage_limit) / (2 ** (DAC_BITS - 1) - 1)
+    run = run_controller(build_structure(both), build_case(both), fixed.controller, step)
+    return float(np.max(run.result.metrics.residual_rms))
+
+
+def tuned_on(true, measured, folder, console):
+    """What the same tuning finds for the true machine, with no reserve of margin."""
+    motion = find_motion(true).study
+    section = tuning_section(measured, motion, {})
+    section["limits"]["gain_margin"] = measured.commission.gain_margin
+    run_tuning(parse_tuning(motion.model_dump() | {"tune": section}), folder, console=console)
+    return with_own_motion(load_design(folder).study, true)

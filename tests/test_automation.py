@@ -70,4 +70,11 @@ def test_calls_and_their_options_exist():
         known = {opt for parameter in commands[name].params for opt in parameter.opts}
         assert {word for word in words if word.startswith("--")} <= known, call
     told = {call.split()[0] for call in calls if "--json" in call}
-    assert told == set(documented()) - {"commission", "fit", "laws", "spillover", "bench"}
+    assert told == set(documented()) - {
+        "commission",
+        "comparison",
+        "fit",
+        "laws",
+        "spillover",
+        "bench",
+    }

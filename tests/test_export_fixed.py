@@ -15,7 +15,15 @@ from studies.export import in_the_loop
 from studies.export.c_fixed import fixed_source
 from studies.export.c_floating import floating_source
 from studies.export.compiler import compiled
-from studies.export.fixed import design_fixed, peak_gains, rail_samples, rounded, shaper_row
+from studies.export.fixed import (
+    check_error,
+    design_fixed,
+    peak_gains,
+    rail_samples,
+    rounded,
+    shaper_row,
+)
+from studies.export.fixed_blocks import design_integers
 from studies.export.floating import respond as respond_floating
 from studies.export.in_the_loop import replay
 from studies.export.integers import respond
@@ -68,6 +76,13 @@ def found_and_codes(data, length=500):
     phase, frequency = rng.uniform(0, 6, (3, 3)), rng.uniform(0.02, 0.4, (3, 3))
     wave = middle + 0.2 * top * np.sin(frequency * time + phase) + rng.normal(size=(length, 3, 3))
     return found, np.clip(np.round(wave), 1, top - 1)
+
+
+def checked_design(found, seen, dac_bits, word=32):
+    """As it is exported: refused if rounding can be seen at the actuators."""
+    fixed = design_fixed(found, seen, dac_bits, word)
+    check_error(found, fixed.error, fixed.wires.dac_step)
+    return fixed
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -272,14 +287,14 @@ def test_what_does_not_fit_words_is_refused(name):
     found, codes = found_and_codes(data, 50)
     seen = respond_floating(found.channels, found.controller, codes)
     with pytest.raises(StudyError, match=message):
-        design_fixed(found, seen, 12)
+        checked_design(found, seen, 12)
 
 
 def test_factors_beyond_a_word_are_refused():
     with pytest.raises(StudyError, match=r"gains: factors add up to 3e\+09 .* allowed: below"):
-        fixed_point.find_row(np.array([[1e9, 2e9, 0.0]]), "gains")
+        fixed_point.find_row(np.array([[1e9, 2e9, 0.0]]), "gains", 32)
     with pytest.raises(StudyError, match="nan"):
-        fixed_point.find_row(np.array([[np.nan, 1.0]]), "gains")
+        fixed_point.find_row(np.array([[np.nan, 1.0]]), "gains", 32)
 
 
 def test_unstable_loops_are_refused_with_their_margin():
@@ -294,6 +309,26 @@ def test_unstable_loops_are_refused_with_their_margin():
     coarse = found.channels._replace(denominator=np.round(found.channels.denominator * 4) / 4)
     with pytest.raises(StudyError, match="coefficients rounded"):
         check_loop(found, coarse, ", coefficients rounded")
+
+
+@pytest.mark.parametrize("law", ["imsc", "srf", "lqg"])
+def test_words_of_16_bits_are_those_of_their_model(law):
+    """Coarse, but the C code does what its model does, and stays within its bound."""
+    found, codes = found_and_codes(changed(PAPER, control={"law": law}))
+    seen = respond_floating(found.channels, found.controller, codes)
+    fixed, _ = design_integers(found, seen, 12, 16)
+    with pytest.raises(StudyError, match="rounding can add up to"):
+        check_error(found, fixed.error, fixed.wires.dac_step)
+    source = fixed_source(found, fixed, "flexlink", ["16 bits"], "")
+    assert "int16_t" in source.code and "static int64_t pose_shifted" in source.code
+    sizes = (9, len(found.channels.names), int(found.taps.sample.max()) + 1)
+    compiler, model = needs_compiler(), respond(fixed, codes, 100)
+    with compiled(source, "flexlink", compiler, np.uint16, np.int32, sizes) as code:
+        np.testing.assert_array_equal(code.respond(codes)[0], model.codes)
+    assert model.limited.sum() == 0
+    volts = (model.codes - fixed.wires.dac_rest) * fixed.wires.dac_step
+    off = np.abs(volts - seen.command).max(axis=0)
+    assert np.all(off <= fixed.error.total) and off.max() > fixed.wires.dac_step
 
 
 def random_design(rng):
@@ -339,7 +374,8 @@ def check_random_designs(count, seed):
         try:
             found, codes = found_and_codes(random_design(rng), 300)
             seen = respond_floating(found.channels, found.controller, codes)
-            fixed = design_fixed(found, seen, int(rng.integers(4, 17)))
+            bits, word = int(rng.integers(4, 17)), int(rng.choice([16, 32]))
+            fixed = checked_design(found, seen, bits, word)
         except StudyError as error:
             assert "allowed" in str(error), (k, error)
             continue

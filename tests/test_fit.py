@@ -122,6 +122,17 @@ def test_derivatives_of_every_kind(bench, every_kind, kind):
     assert np.max(np.abs(found.slope - wanted) / size) < 1e-5
 
 
+@pytest.mark.parametrize("entry", [RESPONSE, TRACE], ids=["response", "trace"])
+def test_a_number_that_is_0_in_the_study_has_an_effect(folder, entry):
+    """Friction, which programs of studies without it leave out."""
+    free = {"drive.coulomb_friction": {"from": 0.0, "to": 2.0}}
+    _, (measurement,), _ = made(spec_of(folder, entry, free=free))
+    none, slope = measurement.predict(np.array([0.0]), True)
+    some, _ = measurement.predict(np.array([1e-3]), False)
+    assert np.abs(slope[:, 0]).max() > 0
+    np.testing.assert_allclose(some - none, 1e-3 * slope[:, 0], atol=3e-5 * np.abs(slope).max())
+
+
 def test_modes_are_paired_by_shape(folder, bench):
     """Three nearly equal modes, measured in another order and mixed with noise."""
     _, (one,), values = made(spec_of(folder, MODES), bench)

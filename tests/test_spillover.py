@@ -24,13 +24,14 @@ from jaxmodel.laws.lqr import optimal_gains
 from jaxmodel.laws.ppf import HIGHEST_RATIO, design_position_filter
 from studies.engine.breaking import TOLERANCES, BreakingChange, ChangedNumber
 from studies.engine.controller import fixed_controller
+from studies.engine.fast_motion import FAST, WINDOW, make_fast
 from studies.engine.runs import run_study
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.show.document import schema
 from studies.spillover import ModelMismatch, certify, patch_lengths
 from studies.spillover import run as spillover_run
-from studies.spillover.fast_move import FAST, WINDOW, make_fast, run_fast_move
+from studies.spillover.fast_move import run_fast_move
 from studies.spillover.plants import LoopBuilder, all_plants, pad_channels
 from studies.spillover.proofs import BOX, AllModes, Proofs, ProvenBox
 from studies.study.cases import as_arrays, build_case, build_structure

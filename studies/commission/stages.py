@@ -10,20 +10,25 @@ import numpy as np
 from rich.console import Console
 
 from studies.commission.machines import Possible, unknown_to_controller
-from studies.commission.spec import MeasuredSpec, tuning_section
+from studies.commission.spec import MeasuredSpec, certified_margin, tuning_section
 from studies.engine.design import Design, load_design
+from studies.engine.fast_motion import TellingMotion, find_motion, with_own_motion
 from studies.export.run import FAILED, export_design
 from studies.export.run import REPORT as VERIFICATION
 from studies.export.targets import TARGETS
 from studies.fitting.run import DATA, DOCUMENT, STUDY, run_fit
-from studies.publish import REPORT
+from studies.publish import REPORT, replacing
 from studies.reading import open_hdf5, read_json
 from studies.spillover.run import DOCUMENT as CERTIFICATE
 from studies.spillover.run import spillover_design
 from studies.study.spec import Study, load_study
+from studies.study.template import study_template
 from studies.tuning.folder import PROGRESS
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import parse_tuning
+
+#: The chosen controller as a study: the fitted machine, the motion of the file.
+DESIGN = "design.toml"
 
 
 class Stage(NamedTuple):
@@ -32,12 +37,12 @@ class Stage(NamedTuple):
     name: str  # of its folder
     text: str
     page: str  # its report
-    last: tuple[str, ...]  # files of which one is written at its end
+    last: tuple[str, ...]  # files of the folder of all stages, of which one is written at its end
     make: Callable[[MeasuredSpec, Path, Console], None]  # in the folder of all stages
 
     def is_done(self, out: Path) -> bool:
         """Whether the folder holds its answer."""
-        return any((out / self.name / file).is_file() for file in self.last)
+        return any((out / file).is_file() for file in self.last)
 
 
 def _fit(measured: MeasuredSpec, out: Path, console: Console) -> None:
@@ -45,18 +50,26 @@ def _fit(measured: MeasuredSpec, out: Path, console: Console) -> None:
 
 
 def _tune(measured: MeasuredSpec, out: Path, console: Console) -> None:
-    study, folder = fitted_study(out), out / "tune"
+    fitted, folder = fitted_study(out), out / "tune"
+    study = fitted
     columns = unknown_to_controller(possible_machines(out), study)
     indexed = [name for name in columns if name.startswith("link.stiffness_factor[")]
     if indexed:  # one number for all links so far
         whole = tuple(np.broadcast_to(study.link.stiffness_factor, 3).tolist())
         study = study.change(link__stiffness_factor=whole)
-    data = study.model_dump() | {"tune": tuning_section(measured, study, columns)}
-    run_tuning(parse_tuning(data), folder, (folder / PROGRESS).is_file(), console)
+    motion = TellingMotion(study, "") if measured.keeps_motion else find_motion(study)
+    if motion.text:
+        console.print(motion.text, soft_wrap=True)
+    section = tuning_section(measured, motion.study, columns)
+    spec = parse_tuning(motion.study.model_dump() | {"tune": section})
+    run_tuning(spec, folder, (folder / PROGRESS).is_file(), console)
+    chosen = with_own_motion(load_design(folder).study, fitted)
+    with replacing(out / DESIGN) as temporary:
+        temporary.write_text(study_template(chosen), encoding="utf-8")
 
 
 def _certify(measured: MeasuredSpec, out: Path, console: Console) -> None:
-    margin = measured.commission.gain_margin
+    margin = certified_margin(measured)
     spillover_design(tuned_design(out), out / "certificate", margin, console)
 
 
@@ -78,28 +91,28 @@ STAGES = (
         name="fit",
         text="fit the model to the measurements",
         page=REPORT,
-        last=(DOCUMENT,),
+        last=(f"fit/{DOCUMENT}",),
         make=_fit,
     ),
     Stage(
         name="tune",
         text="tune on machines that the data leave possible",
         page=REPORT,
-        last=(REPORT,),
+        last=(DESIGN,),
         make=_tune,
     ),
     Stage(
         name="certificate",
         text="certify on plants that differ from the model",
         page=REPORT,
-        last=(CERTIFICATE,),
+        last=(f"certificate/{CERTIFICATE}",),
         make=_certify,
     ),
     Stage(
         name="firmware",
         text="export, compare, emulate",
         page=VERIFICATION,
-        last=(VERIFICATION, FAILED),
+        last=(f"firmware/{VERIFICATION}", f"firmware/{FAILED}"),
         make=_export,
     ),
 )
@@ -121,8 +134,8 @@ def fitted_study(out: Path) -> Study:
 
 
 def tuned_design(out: Path) -> Design:
-    """The tuned study."""
-    return load_design(out / "tune")
+    """The chosen controller with the fitted machine and the motion of the file."""
+    return load_design(out / DESIGN)
 
 
 def possible_machines(out: Path) -> Possible:

@@ -1,4 +1,4 @@
-"""C99 of a controller in 32-bit fixed point."""
+"""C99 of a controller in fixed point."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from studies.engine.blocks import ModalBlocks
 from studies.engine.channels import ActiveChannels
 from studies.engine.controller import FixedController
 from studies.export.c_text import Source, source
-from studies.export.fixed import WORD, FixedPoint, IntegerRow, shaper_row
+from studies.export.fixed import FixedPoint, IntegerRow, shaper_row
 from studies.export.fixed_blocks import FixedBlocks
 
 
@@ -39,6 +39,8 @@ def fixed_source(
         origin,
         fixed=fixed,
         word="int32_t",
+        count=f"int{wires.word}_t",
+        word_bits=wires.word,
         wire="uint16_t",
         formats=format_lines(fixed, exported),
         cost=cost,
@@ -96,6 +98,6 @@ def format_lines(fixed: FixedPoint | FixedBlocks, exported: FixedController) -> 
             unit = unit if exported.is_modal else "V"
             lines.append(
                 f"{f'{text}, {name}':<30}{form.bits[m]:>4}{f'{form.base[m]:.9e} {unit}':>20}"
-                f"{2.0 ** (WORD - 1 - form.bits[m]):>9.0f}{form.bound[m] / form.base[m]:>9.1f}"
+                f"{form.largest[m] / form.base[m]:>9.0f}{form.bound[m] / form.base[m]:>9.1f}"
             )
     return lines

@@ -26,6 +26,7 @@ def floating_source(exported: FixedController, name: str, origin: Iterable[str])
         origin,
         fixed=None,
         word=f"{name}_real",
+        count=f"{name}_real",
         wire=f"{name}_real",
         is_modal=exported.is_modal,
         feedthrough=exported.controller.feedthrough.reshape(-1, exported.n_patches),

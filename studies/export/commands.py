@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from studies.config import start
+from studies.errors import StudyError
 
 
 def add_commands(app: typer.Typer, console: Console) -> None:
@@ -18,8 +19,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     @app.command()
     def export(
         design: Annotated[Path, typer.Argument(help="study file, folder of a tuning or a sweep")],
-        target: Annotated[str, typer.Option(help="json, c, or c-fixed (32-bit fixed point)")],
         out: Annotated[Path, typer.Option(help="folder for the files")],
+        target: Annotated[
+            str | None, typer.Option(help="json, c, or c-fixed (32-bit fixed point)")
+        ] = None,
         case: Annotated[
             str | None,
             typer.Option(help="case of a sweep (number or id:...) or family of a tuning"),
@@ -42,17 +45,33 @@ def add_commands(app: typer.Typer, console: Console) -> None:
                 "cortex-m4f or cortex-m7; with a project to build for it"
             ),
         ] = None,
+        compare: Annotated[
+            bool,
+            typer.Option(
+                "--compare",
+                help="no code, but a table: single precision, 32 and 16 bits at 5, 10 and 20 kHz",
+            ),
+        ] = False,
     ) -> None:
         """Export the controller of a design to a real-time target, and verify it."""
         from studies.publish import check_folder
 
+        if compare and (target is not None or verify is not None):
+            other = "--target" if target is not None else "--verify"
+            raise StudyError(f"--compare: not allowed with {other}; leave one of them out")
+        if not compare and target is None:
+            raise StudyError("--target: missing; allowed: json, c, c-fixed (or --compare)")
         check_folder(out)
         start()
         from studies.engine.design import load_design
         from studies.export.run import export_design
 
         chosen = load_design(design, case)
-        if not export_design(chosen, target, out, verify, name, dac_bits, console, pil).is_good:
+        if target is None:
+            from studies.export.comparison import compare_variants
+
+            compare_variants(chosen, out, dac_bits, pil, console)
+        elif not export_design(chosen, target, out, verify, name, dac_bits, console, pil).is_good:
             sys.exit(1)
 
     @app.command("import-gains")

@@ -1,9 +1,10 @@
 """Fixed point: formats, integer coefficients, and bounds on rounding errors.
 
-Words have 32 bits, sums of products 64. A signal is `base * integer / 2^bits`, per unit of its own
-base, the range seen in the simulation; it has as many bits as leave room for the largest value that
-any sequence of ADC codes can produce. A coefficient is `integer / 2^shift` between the integers of
-two signals, so that gains of 570 V/N and filters of 1e-6 m/V become numbers of similar size.
+Words have 32 or 16 bits, sums of products twice as many. A signal is `base * integer / 2^bits`, per
+unit of its own base, the range seen in the simulation; it has as many bits as leave room for the
+largest value that any sequence of ADC codes can produce. A coefficient is `integer / 2^shift`
+between the integers of two signals, so that gains of 570 V/N and filters of 1e-6 m/V become numbers
+of similar size.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from studies.engine.controller import FixedController
 from studies.errors import StudyError, field_error
 from studies.export.floating import Signals, respond_from
 
-#: Bits of a word, sign included.
+#: Bits of a word, sign included: what is usual; the shaper has no others.
 WORD = 32
 #: A format has room for at least this many times the largest simulated value [1].
 MARGIN = 2
@@ -45,6 +46,7 @@ class Format(NamedTuple):
     bits: np.ndarray  # fraction bits, (M,)
     seen: np.ndarray  # largest value in the simulation, (M,)
     bound: np.ndarray  # largest value that ADC codes can produce, (M,)
+    largest: np.ndarray  # that a word has room for, (M,)
 
     @property
     def step(self) -> np.ndarray:
@@ -54,8 +56,8 @@ class Format(NamedTuple):
     @property
     def margin(self) -> np.ndarray:
         """Largest representable value over the largest one seen; inf if none was seen, (M,)."""
-        largest = self.step * 2.0 ** (WORD - 1)
-        return np.where(self.seen > 0, largest / np.where(self.seen > 0, self.seen, 1.0), np.inf)
+        seen = np.where(self.seen > 0, self.seen, 1.0)
+        return np.where(self.seen > 0, self.largest / seen, np.inf)
 
 
 class IntegerRow(NamedTuple):
@@ -72,6 +74,7 @@ class IntegerRow(NamedTuple):
 class Wires(NamedTuple):
     """Sensors and actuators in fixed point. Integers unless said otherwise."""
 
+    word: int  # bits of a signal
     adc_bits: int  # fraction bits of a sensor signal, whose base is one ADC code
     adc_top: int
     bias: int  # of the conditioner, as a sensor signal
@@ -136,13 +139,16 @@ def rail_samples(rate: float) -> int:
     return min(max(round(RAIL_TIME * rate), 2), 2**15 - 1)
 
 
-def design_fixed(exported: FixedController, signals: Signals, dac_bits: int) -> FixedPoint:
-    """Formats and coefficients for a controller.
+def design_fixed(
+    exported: FixedController, signals: Signals, dac_bits: int, word: int = WORD
+) -> FixedPoint:
+    """Formats and coefficients for a controller; see `check_error` for what rounding does.
 
     Args:
         exported: the controller.
         signals: signals of the simulated motion, (T, ...).
         dac_bits: resolution of the DAC, whose codes 1 to 2^bits - 1 span +-voltage_limit.
+        word: bits of a signal, 16 or 32.
 
     Raises:
         StudyError: what cannot be represented, with the number and a remedy.
@@ -158,16 +164,16 @@ def design_fixed(exported: FixedController, signals: Signals, dac_bits: int) -> 
             "what a switch brings back by feed-through has no bound",
             "1",
         )
-    wires = design_wires(exported, dac_bits)
+    wires = design_wires(exported, dac_bits, word)
     step, dac_step = wires.sensor_step, wires.dac_step
     memory = channels.memory(FORGOTTEN)
     gains = peak_gains(channels, memory)
     sensor = sensor_bound(controller)  # (3, K)
     bound = np.sum(np.abs(channels.filter) * sensor[channels.link], axis=1)
-    signal = find_format(signals.signal, bound)
-    high = find_format(signals.high, bound * gains.high)
-    inner = find_format(signals.inner, bound * gains.inner)
-    force = find_format(signals.force, bound * gains.force)
+    signal = find_format(signals.signal, bound, word)
+    high = find_format(signals.high, bound * gains.high, word)
+    inner = find_format(signals.inner, bound * gains.inner, word)
+    force = find_format(signals.force, bound * gains.force, word)
     b0, b1, a1 = channels.first.T
     one = np.ones_like(b0)
     tap = channels.force * (inner.step / force.step)[:, None]
@@ -180,27 +186,28 @@ def design_fixed(exported: FixedController, signals: Signals, dac_bits: int) -> 
         high=high,
         inner=inner,
         force=force,
-        filter=find_row(channels.filter * step / signal.step[:, None], "modal filter"),
-        high_pass=find_row((b0 * signal.step / high.step)[:, None], "high-pass"),
-        memory=find_row(np.stack([b1 * signal.step / high.step, -a1], 1), "high-pass"),
+        filter=find_row(channels.filter * step / signal.step[:, None], "modal filter", word),
+        high_pass=find_row((b0 * signal.step / high.step)[:, None], "high-pass", word),
+        memory=find_row(np.stack([b1 * signal.step / high.step, -a1], 1), "high-pass", word),
         low_pass=find_row(
             np.stack([one * high.step / inner.step, *-channels.denominator.T], 1),
             "low-pass",
+            word,
         ),
         numerator=find_row(
-            np.column_stack([tap, channels.direct * signal.step / force.step]), "gains"
+            np.column_stack([tap, channels.direct * signal.step / force.step]),
+            "gains",
+            word,
         ),
-        synthesizer=find_row(back * force.step / dac_step, "synthesizer"),
+        synthesizer=find_row(back * force.step / dac_step, "synthesizer", word),
         is_rival=channels.is_rival,
-        energy=_energy(channels, bound, inner, signal, memory),
+        energy=_energy(channels, bound, inner, signal, memory, word),
         error=ErrorBound(*np.zeros((3, 3, exported.n_patches))),
     )
-    error = _error_bound(exported, fixed, gains, memory)
-    check_error(exported, error, dac_step)
-    return fixed._replace(error=error)
+    return fixed._replace(error=_error_bound(exported, fixed, gains, memory))
 
 
-def design_wires(exported: FixedController, dac_bits: int) -> Wires:
+def design_wires(exported: FixedController, dac_bits: int, word: int) -> Wires:
     """Formats of sensors and actuators.
 
     Raises:
@@ -211,18 +218,19 @@ def design_wires(exported: FixedController, dac_bits: int) -> Wires:
     dac_step = float(controller.voltage_limit) / (rest - 1)
     code = float(controller.adc_step / controller.adc_gain)  # one ADC code at the sensor [V]
     largest = sensor_bound(controller).max() / code
-    adc_bits = int(_bits(largest))
+    adc_bits = int(_bits(largest, word))
     if adc_bits < 0:
         raise StudyError(
             f"fixed point: sensor signals can be {largest:.3g} ADC codes; allowed: "
-            f"{2.0 ** (WORD - 1):.3g}; lower control.feedthrough_factor or "
+            f"{2.0 ** (word - 1):.3g}; lower control.feedthrough_factor or "
             "electronics.voltage_limit, or take --target c"
         )
     step = code / 2.0**adc_bits
     through = None
     if np.any(controller.feedthrough):
-        through = find_row(controller.feedthrough * dac_step / step, "feed-through")
+        through = find_row(controller.feedthrough * dac_step / step, "feed-through", word)
     return Wires(
+        word=word,
         adc_bits=adc_bits,
         adc_top=int(controller.adc_top),
         bias=round(float(controller.adc_bias) / float(controller.adc_step) * 2**adc_bits),
@@ -268,15 +276,21 @@ def check_words(exported: FixedController) -> None:
 
 
 def _energy(
-    channels: ActiveChannels, bound: np.ndarray, inner: Format, signal: Format, memory: int
+    channels: ActiveChannels,
+    bound: np.ndarray,
+    inner: Format,
+    signal: Format,
+    memory: int,
+    word: int,
 ) -> IntegerRow | None:
-    """Roots of the energies of rivals: the squares of two of them sum within 63 bits.
+    """Roots of the energies of rivals: the squares of two of them sum within two words.
 
     Args:
         channels: folded controller.
         bound: largest signals, (M,).
         inner, signal: formats of the terms of the roots.
         memory: samples of the impulse responses.
+        word: bits of a signal.
     """
     if channels.energy is None:
         return None
@@ -292,10 +306,10 @@ def _energy(
             root = scipy.signal.lfilter(row[:3], [1.0], line)
             root[0] += row[3]
             largest[m, part] = bound[m] * np.abs(root).sum()
-    step = largest.max() / 2.0 ** (WORD - 3)
+    step = largest.max() / 2.0 ** (word - 3)
     factors = channels.energy * inner.step[:, None, None] / step
     factors[..., 3] = channels.energy[..., 3] * signal.step[:, None] / step
-    return find_row(factors, "modal energies")
+    return find_row(factors, "modal energies", word)
 
 
 def _responses(channels: ActiveChannels, m: int, n: int) -> tuple[np.ndarray, ...]:
@@ -329,30 +343,31 @@ def sensor_bound(controller: Controller) -> np.ndarray:
     return np.abs(ends / controller.adc_gain).max() + own
 
 
-def _bits(largest: np.ndarray) -> np.ndarray:
+def _bits(largest: np.ndarray, word: int) -> np.ndarray:
     """Fraction bits with room for values up to `largest`, with some margin for rounding."""
-    return np.floor(WORD - 1 - np.log2(largest * (1 + 1e-4))).astype(int)
+    return np.floor(word - 1 - np.log2(largest * (1 + 1e-4))).astype(int)
 
 
-def find_format(seen: np.ndarray, bound: np.ndarray) -> Format:
+def find_format(seen: np.ndarray, bound: np.ndarray, word: int) -> Format:
     """Format of a signal, (M,), from its values over time and its bound."""
     peak = np.abs(seen).max(axis=0)
     # a channel at rest in the simulation has no range
     base = np.where(peak > bound * 2.0**-20, peak, bound)
-    return Format(base, _bits(np.maximum(bound, MARGIN * peak) / base), peak, bound)
+    bits = _bits(np.maximum(bound, MARGIN * peak) / base, word)
+    return Format(base, bits, peak, bound, largest=base * 2.0 ** (word - 1 - bits))
 
 
-def find_row(factors: np.ndarray, name: str) -> IntegerRow:
-    """Integers and shifts of rows of factors, (..., n)."""
+def find_row(factors: np.ndarray, name: str, word: int) -> IntegerRow:
+    """Integers and shifts of rows of factors, (..., n), for words of so many bits."""
     total = np.abs(factors).sum(axis=-1)
     safe = np.where(total > 0, total, 1.0)
-    shift = np.floor(WORD - 1 - np.log2(safe * (1 + 1e-6)))
+    shift = np.floor(word - 1 - np.log2(safe * (1 + 1e-6)))
     if not np.all(np.isfinite(total)) or shift.min() < 1:
         raise StudyError(
-            f"{name}: factors add up to {total.max():.3g} between words of {WORD} bits; allowed: "
-            f"below {2.0 ** (WORD - 2):.3g}; lower control.gain_factor, or take --target c"
+            f"{name}: factors add up to {total.max():.3g} between words of {word} bits; allowed: "
+            f"below {2.0 ** (word - 2):.3g}; lower control.gain_factor, or take --target c"
         )
-    shift = np.minimum(shift, 62).astype(int)
+    shift = np.minimum(shift, 2 * word - 2).astype(int)
     return IntegerRow(np.round(factors * 2.0 ** shift[..., None]).astype(np.int64), shift)
 
 
@@ -436,6 +451,11 @@ def output_error_bound(exported: FixedController, error: np.ndarray) -> np.ndarr
 
 
 def check_error(exported: FixedController, error: ErrorBound, dac_step: float) -> None:
+    """Reject a controller whose rounding can be seen at the actuators.
+
+    Raises:
+        StudyError: it can be, with how much and a remedy.
+    """
     worst = error.inside
     if worst.max() <= ALLOWED_ERROR * dac_step:
         return
@@ -455,7 +475,7 @@ def shaper_row(taps: Taps) -> IntegerRow:
     Raises:
         StudyError: weights too large for a word.
     """
-    row = find_row(np.asarray(taps.weight)[None], "input shaper")
+    row = find_row(np.asarray(taps.weight)[None], "input shaper", WORD)
     integers, shift = row.integers[0], int(row.shift[0])
     left = round(float(np.sum(taps.weight)) * 2**shift) - int(integers.sum())
     largest = np.argmax(np.abs(integers))

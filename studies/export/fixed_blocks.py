@@ -13,24 +13,28 @@ import numpy as np
 
 from jaxmodel.state_space import StateSpace, dense
 from studies.engine.blocks import ImpulseResponses, ModalBlocks, responses
+from studies.engine.channels import ActiveChannels
 from studies.engine.controller import FixedController
 from studies.errors import StudyError
 from studies.export.fixed import (
     FORGOTTEN,
     LONGEST_MEMORY,
+    WORD,
     ErrorBound,
+    FixedPoint,
     Format,
     IntegerRow,
     Wires,
-    check_error,
     check_words,
+    design_fixed,
     design_wires,
     find_format,
     find_row,
     output_error_bound,
+    rounded,
     sensor_bound,
 )
-from studies.export.floating import BlockSignals
+from studies.export.floating import BlockSignals, Signals
 
 
 class FixedBlocks(NamedTuple):
@@ -62,12 +66,14 @@ class FixedBlocks(NamedTuple):
         return
 
 
-def design_blocks(exported: FixedController, signals: BlockSignals, dac_bits: int) -> FixedBlocks:
+def design_blocks(
+    exported: FixedController, signals: BlockSignals, dac_bits: int, word: int = WORD
+) -> FixedBlocks:
     """Formats and coefficients; arguments and errors as `studies.export.fixed.design_fixed`."""
     blocks = exported.channels
     assert isinstance(blocks, ModalBlocks)
     check_words(exported)
-    wires = design_wires(exported, dac_bits)
+    wires = design_wires(exported, dac_bits, word)
     system, memory = blocks.system, blocks.memory(FORGOTTEN)
     groups, n, _, size = system.enter.shape
     volts = blocks.of_groups(sensor_bound(exported.controller))  # (G, M)
@@ -78,7 +84,7 @@ def design_blocks(exported: FixedController, signals: BlockSignals, dac_bits: in
         limit = float(exported.controller.voltage_limit)
         bounds = [_bound_observer(blocks, g, volts[g], limit) for g in range(groups)]
     bound = np.stack(bounds)
-    state = find_format(signals.state, np.maximum(bound, np.finfo(float).tiny))
+    state = find_format(signals.state, np.maximum(bound, np.finfo(float).tiny), word)
     step, sensor = state.step, wires.sensor_step
     within = system.state * step[:, :, None, :] / step[..., None]
     entering = system.enter * sensor / step[..., None]
@@ -88,16 +94,14 @@ def design_blocks(exported: FixedController, signals: BlockSignals, dac_bits: in
         wires=wires,
         blocks=blocks,
         state=state,
-        advance=find_row(np.concatenate([within, entering], axis=3), "states"),
-        leave=find_row(np.concatenate([leaving, direct], axis=2), "outputs"),
+        advance=find_row(np.concatenate([within, entering], axis=3), "states", word),
+        leave=find_row(np.concatenate([leaving, direct], axis=2), "outputs", word),
         error=ErrorBound(*np.zeros((3, 3, exported.n_patches))),
         anti_windup=None
         if system.anti_windup is None
-        else find_row(system.anti_windup * wires.dac_step / step[..., None], "anti-windup"),
+        else find_row(system.anti_windup * wires.dac_step / step[..., None], "anti-windup", word),
     )
-    error = _error_bound(exported, blocks, fixed, each, memory)
-    check_error(exported, error, wires.dac_step)
-    return fixed._replace(error=error)
+    return fixed._replace(error=_error_bound(exported, blocks, fixed, each, memory))
 
 
 def rounded_blocks(fixed: FixedBlocks, like: ModalBlocks) -> ModalBlocks:
@@ -117,6 +121,29 @@ def rounded_blocks(fixed: FixedBlocks, like: ModalBlocks) -> ModalBlocks:
             else fixed.anti_windup.values * step[..., None] / wires.dac_step,
         )
     )
+
+
+def design_integers(
+    exported: FixedController, signals: Signals | BlockSignals, dac_bits: int, word: int = WORD
+) -> tuple[FixedPoint | FixedBlocks, ActiveChannels | ModalBlocks]:
+    """A controller of either kind in fixed point, and what its integers represent.
+
+    Args:
+        exported: the controller.
+        signals: of the simulated motion, from `studies.export.floating.respond`.
+        dac_bits: resolution of the DAC.
+        word: bits of a signal, 16 or 32.
+
+    Raises:
+        StudyError: what cannot be represented, with the number and a remedy.
+    """
+    if isinstance(exported.channels, ModalBlocks):
+        assert isinstance(signals, BlockSignals)
+        blocks = design_blocks(exported, signals, dac_bits, word)
+        return blocks, rounded_blocks(blocks, exported.channels)
+    assert isinstance(signals, Signals)
+    fixed = design_fixed(exported, signals, dac_bits, word)
+    return fixed, rounded(fixed, exported.channels)
 
 
 def _bound_observer(

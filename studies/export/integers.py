@@ -18,15 +18,28 @@ class Response(NamedTuple):
     """Results of the integer arithmetic; counts are per sample, (T, ...)."""
 
     codes: np.ndarray  # of the DAC, (T, ..., 3, K)
-    limited: np.ndarray  # internal signals clipped to 32 bits
+    limited: np.ndarray  # internal signals clipped to words
     saturated: np.ndarray  # actuators at their limit
     is_faulty: np.ndarray  # whether actuators are at rest because of a faulty sensor
+
+
+class _Limit:
+    """Words of so many bits; `cut` counts, call by call, what was clipped in each sequence."""
+
+    def __init__(self, word: int) -> None:
+        self._most = 2 ** (word - 1) - 1
+        self.cut: list[np.ndarray] = []
+
+    def __call__(self, x: np.ndarray, axes: tuple[int, ...] = CHANNELS) -> np.ndarray:
+        inside = np.minimum(np.maximum(x, -self._most - 1), self._most)
+        self.cut.append(np.sum(x != inside, axis=axes))
+        return inside
 
 
 class _Memory(Protocol):
     """What the arithmetic remembers between samples."""
 
-    def step(self, sensor: np.ndarray, cut: list[np.ndarray]) -> np.ndarray:
+    def step(self, sensor: np.ndarray, limit: _Limit) -> np.ndarray:
         """Counts for the actuators, (..., 3, K), from those of the sensors."""
         ...
 
@@ -59,18 +72,18 @@ def respond(fixed: FixedPoint | FixedBlocks, codes: np.ndarray, rail: int) -> Re
         at_end = np.where(end * at_end > 0, at_end, 0) + end
         bad = ((code > wires.adc_top) | (np.abs(at_end) >= rail)) & is_used
         is_faulty = is_faulty | bad.any(axis=(-2, -1))
-        cut: list[np.ndarray] = []  # per sequence, how many were clipped
-        sensor = _clip(code * 2**wires.adc_bits - wires.bias, cut, SENSORS)
+        limit = _Limit(wires.word)
+        sensor = limit(code * 2**wires.adc_bits - wires.bias, SENSORS)
         if wires.feedthrough is not None:
             own = _rounded_sums(wires.feedthrough, command[..., None, :])
-            sensor = _clip(sensor - own, cut, SENSORS)
-        demand = _clip(memory.step(sensor, cut), cut, SENSORS)
+            sensor = limit(sensor - own, SENSORS)
+        demand = memory.step(sensor, limit)
         command = np.minimum(np.maximum(demand, 1 - wires.dac_rest), wires.dac_rest - 1)
         memory.reset(is_faulty)
         command = np.where(is_faulty[..., None, None], 0, command)
         full = np.sum(np.abs(command) == wires.dac_rest - 1, axis=(-2, -1))
         # a faulty sample ends before the arithmetic
-        n_cut = np.where(is_faulty, 0, np.sum(cut, axis=0))
+        n_cut = np.where(is_faulty, 0, np.sum(limit.cut, axis=0))
         rows.append((command + wires.dac_rest, n_cut, full, is_faulty))
     return Response(*map(np.stack, zip(*rows, strict=True)))
 
@@ -82,16 +95,16 @@ class _ChannelMemory:
         self._fixed = fixed
         self._high, self._older, self._old = np.zeros((3, *many, len(fixed.link)), np.int64)
 
-    def step(self, sensor: np.ndarray, cut: list[np.ndarray]) -> np.ndarray:
+    def step(self, sensor: np.ndarray, limit: _Limit) -> np.ndarray:
         fixed, old, older = self._fixed, self._old, self._older
-        signal = _clip(_rounded_sums(fixed.filter, sensor[..., fixed.link, :]), cut)
-        high = _clip(_rounded_sums(fixed.high_pass, signal[..., None]) + self._high, cut)
-        self._high = _clip(_rounded_sums(fixed.memory, np.stack([signal, high], -1)), cut)
-        inner = _clip(_rounded_sums(fixed.low_pass, np.stack([high, old, older], -1)), cut)
+        signal = limit(_rounded_sums(fixed.filter, sensor[..., fixed.link, :]))
+        high = limit(_rounded_sums(fixed.high_pass, signal[..., None]) + self._high)
+        self._high = limit(_rounded_sums(fixed.memory, np.stack([signal, high], -1)))
+        inner = limit(_rounded_sums(fixed.low_pass, np.stack([high, old, older], -1)))
         taps = np.stack([inner, old, older, signal], -1)
-        force = _clip(_rounded_sums(fixed.numerator, taps), cut)
+        force = limit(_rounded_sums(fixed.numerator, taps))
         if fixed.energy is not None:
-            roots = _clip(_rounded_sums(fixed.energy, taps[..., None, :]), cut, SENSORS)
+            roots = limit(_rounded_sums(fixed.energy, taps[..., None, :]), SENSORS)
             energy = np.sum(roots * roots, axis=-1)
             force = np.where(acting(fixed.link, fixed.is_rival, energy), force, 0)
         self._older, self._old = old, inner
@@ -111,7 +124,7 @@ class _BlockMemory:
         self._fixed = fixed
         self._state = np.zeros((*many, *fixed.state.bits.shape), np.int64)
 
-    def step(self, sensor: np.ndarray, cut: list[np.ndarray]) -> np.ndarray:
+    def step(self, sensor: np.ndarray, limit: _Limit) -> np.ndarray:
         fixed, state = self._fixed, self._state
         volts = fixed.blocks.of_groups(sensor)  # (..., G, M)
         flat = state.reshape(*state.shape[:-2], -1)
@@ -121,20 +134,13 @@ class _BlockMemory:
         after = _rounded_sums(fixed.advance, read)
         if fixed.anti_windup is not None:
             most = fixed.wires.dac_rest - 1
-            change = _clip(np.clip(counts, -most, most) - counts, cut, SENSORS)
+            change = limit(np.clip(counts, -most, most) - counts, SENSORS)
             after = after + _rounded_sums(fixed.anti_windup, change[..., None, None, :])
-        self._state = _clip(after, cut, STATES)
+        self._state = limit(after, STATES)
         return fixed.blocks.of_patches(counts, sensor.shape[-1])
 
     def reset(self, is_faulty: np.ndarray) -> None:
         self._state = np.where(is_faulty[..., None, None, None], 0, self._state)
-
-
-def _clip(x: np.ndarray, cut: list[np.ndarray], axes: tuple[int, ...] = CHANNELS) -> np.ndarray:
-    """Clip to 32 bits; the number clipped in each sequence is appended to `cut`."""
-    inside = np.minimum(np.maximum(x, -(2**31)), 2**31 - 1)
-    cut.append(np.sum(x != inside, axis=axes))
-    return inside
 
 
 def _rounded_sums(row: IntegerRow, x: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from studies.engine.design import Design
 from studies.errors import StudyError, field_error, nearest
 from studies.export.compiler import NO_COMPILER, find_compiler
 from studies.export.document import study_hash
-from studies.export.firmware.boards import BOARDS
+from studies.export.firmware.boards import BOARDS, Board
 from studies.export.firmware.build import check_tools
 from studies.export.job import Job
 from studies.export.report import report
@@ -75,8 +75,10 @@ def export_design(
         StudyError: an argument out of range, or a controller that cannot be exported.
     """
     _check_arguments(target, name, dac_bits)
-    if pil is not None:
+    bits = checked_bits(dac_bits)
+    if pil is not None and pil in BOARDS:
         _check_processor(pil, target, is_verified)
+    board = checked_board(pil)
     out = Path(out)
     check_folder(out)
     console = console or Console(highlight=False, markup=False)
@@ -101,9 +103,9 @@ def export_design(
         case_id=design.case_id,
         compiler=compiler,
         is_verified=is_verified,
-        dac_bits=dac_bits or DAC_BITS,
+        dac_bits=bits,
         console=console,
-        board=None if pil is None else BOARDS[pil],
+        board=board,
     )
     result = TARGETS[target].make(job)
     for file in result.files:
@@ -129,24 +131,42 @@ def _check_arguments(target: str, name: str, dac_bits: int | None) -> None:
         raise field_error("--target", target, ", ".join(TARGETS), hint=nearest(target, TARGETS))
     if not _NAME.fullmatch(name) or name == "stdint":  # a header that the code includes
         raise field_error("--name", name, "letters, digits and _, 31 at most, a letter first")
-    if dac_bits is None:
-        return
-    if not TARGETS[target].has_dac:
+    if dac_bits is not None and not TARGETS[target].has_dac:
         raise StudyError(f"--dac-bits {dac_bits}: not allowed with --target {target}; leave it out")
+
+
+def checked_bits(dac_bits: int | None) -> int:
+    """Resolution of a DAC; None: the usual one.
+
+    Raises:
+        StudyError: out of range.
+    """
     low, high = _DAC_BITS
-    if not low <= dac_bits <= high:
+    if dac_bits is not None and not low <= dac_bits <= high:
         raise field_error("--dac-bits", dac_bits, f"{low} to {high}", "1")
+    return dac_bits or DAC_BITS
+
+
+def checked_board(pil: str | None) -> Board | None:
+    """The emulated processor of that name, if there are tools for it; None: none is wanted.
+
+    Raises:
+        StudyError: another name, or a tool is missing.
+    """
+    if pil is None:
+        return None
+    if pil not in BOARDS:
+        raise field_error("--pil", pil, ", ".join(BOARDS), hint=nearest(pil, BOARDS))
+    check_tools()
+    return BOARDS[pil]
 
 
 def _check_processor(pil: str, target: str, is_verified: bool | None) -> None:
-    if pil not in BOARDS:
-        raise field_error("--pil", pil, ", ".join(BOARDS), hint=nearest(pil, BOARDS))
     if not TARGETS[target].has_pil:
         allowed = ", ".join(name for name, x in TARGETS.items() if x.has_pil)
         raise StudyError(f"--pil {pil}: not allowed with --target {target}; allowed: {allowed}")
     if is_verified is False:
         raise StudyError(f"--pil {pil}: not allowed with --no-verify; leave one of them out")
-    check_tools()
 
 
 def _origin(exported: FixedController, case_id: str) -> list[str]:

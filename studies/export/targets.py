@@ -12,9 +12,6 @@ from typing import NamedTuple
 
 from jaxmodel.drives import DRIVES
 from jaxmodel.table import Table
-from studies.engine.blocks import ModalBlocks
-from studies.engine.channels import ActiveChannels
-from studies.engine.controller import FixedController
 from studies.export.c_drive import drive_code
 from studies.export.c_fixed import fixed_source
 from studies.export.c_floating import floating_source
@@ -22,9 +19,9 @@ from studies.export.c_text import Source
 from studies.export.cost import cost_of
 from studies.export.document import document, schema, to_json
 from studies.export.firmware.on_target import Comparison, verify_on_target
-from studies.export.fixed import FixedPoint, Wires, check_words, design_fixed, rounded
-from studies.export.fixed_blocks import FixedBlocks, design_blocks, rounded_blocks
-from studies.export.floating import BlockSignals, Signals, respond
+from studies.export.fixed import Wires, check_error, check_words
+from studies.export.fixed_blocks import design_integers
+from studies.export.floating import respond
 from studies.export.job import ExportResult, Job, check_loop, reference_motion
 from studies.export.verify import drive_checks, verify_document, verify_fixed, verify_floating
 
@@ -79,7 +76,8 @@ def _export_fixed(job: Job) -> ExportResult:
     check_loop(exported, exported.channels, "")
     reference = reference_motion(job)
     signals = respond(exported.channels, exported.controller, reference.codes)
-    fixed, near = _design(exported, signals, job.dac_bits)
+    fixed, near = design_integers(exported, signals, job.dac_bits)
+    check_error(exported, fixed.error, fixed.wires.dac_step)
     loop = check_loop(exported, near, ", coefficients rounded to 32 bits")
     cost = cost_of(exported, fixed)
     job.console.print(cost.text)
@@ -116,19 +114,6 @@ def _on_target(job: Job, result: ExportResult, source: Source, wires: Wires | No
         verified=verified._replace(checks=[*verified.checks, *found.checks], runs=runs),
         on_target=found,
     )
-
-
-def _design(
-    exported: FixedController, signals: Signals | BlockSignals, dac_bits: int
-) -> tuple[FixedPoint | FixedBlocks, ActiveChannels | ModalBlocks]:
-    """A controller in fixed point, and what its integers represent."""
-    if isinstance(exported.channels, ModalBlocks):
-        assert isinstance(signals, BlockSignals)
-        blocks = design_blocks(exported, signals, dac_bits)
-        return blocks, rounded_blocks(blocks, exported.channels)
-    assert isinstance(signals, Signals)
-    fixed = design_fixed(exported, signals, dac_bits)
-    return fixed, rounded(fixed, exported.channels)
 
 
 def _files(source: Source, name: str) -> dict[str, str]:

@@ -26,7 +26,7 @@ from studies.engine.preflight import check_pose
 from studies.engine.programs import kept_jit
 from studies.errors import StudyError, field_error
 from studies.space.free import Place, Placing
-from studies.study.cases import as_arrays, build_structure, case_of
+from studies.study.cases import as_arrays, build_structure, case_of, with_used
 from studies.study.consistency import each_link
 from studies.study.labels import describe
 from studies.study.numbers import Numbers, one_study
@@ -137,13 +137,21 @@ def _place_with_outputs(
 class Bench:
     """Plants at all poses that measurements need, kept for the last parameters."""
 
-    def __init__(self, study: Study, place: Place, poses: Sequence[Pose], places: Sequence[float]):
+    def __init__(
+        self,
+        study: Study,
+        place: Place,
+        poses: Sequence[Pose],
+        places: Sequence[float],
+        moving: Sequence[str] = (),
+    ):
         """
         Args:
             study: the model.
             place: puts parameters among the numbers.
             poses: where measurements were taken.
             places: positions along the links of hammers and displacement sensors [m].
+            moving: fields of the parameters, which may be 0 in the study.
 
         Raises:
             StudyError: hammers with a basis whose ends are off the chord.
@@ -161,7 +169,7 @@ class Bench:
         )
         study = study.change(control__feedback="none", shaper__kind="none")
         self.study, self.place = with_outputs_at(study, place, self.stations)
-        self.structure = build_structure(self.study)
+        self.structure = with_used(build_structure(self.study), moving)
         self.numbers = as_arrays(one_study(self.study, self.structure))
         self.n_patches = self.structure.n_patches
         self.poses = tuple(dict.fromkeys(poses))

@@ -59,7 +59,7 @@ def make_bench(spec: FitSpec) -> Bench:
         if isinstance(entry, PoseEntry) and not is_held:
             poses.setdefault(_pose(spec, entry), f"fit.data[{k}].pose")
     places = _places(spec, (ResponseEntry, SpectrumEntry))
-    bench = Bench(spec.study, spec.free.place, tuple(poses), places)
+    bench = Bench(spec.study, spec.free.place, tuple(poses), places, spec.free.fields)
     for pose, path in poses.items():
         bench.check(pose, path)
     return bench
@@ -71,10 +71,9 @@ def make_measurements(spec: FitSpec, bench: Bench) -> list[Measurement]:
     Raises:
         StudyError: a file that cannot be used, data that do not fit the machine.
     """
-    inputs = spec.study, spec.free.place
-    models = Models(
-        bench, Runs(*inputs), Motions(*inputs, _places(spec, (TraceEntry, SettlingEntry)))
-    )
+    inputs, moving = (spec.study, spec.free.place), spec.free.fields
+    places = _places(spec, (TraceEntry, SettlingEntry))
+    models = Models(bench, Runs(*inputs, moving), Motions(*inputs, places, moving))
     return [
         _MAKERS[type(entry)](spec, models, entry, f"fit.data[{k}]")
         for k, entry in enumerate(spec.entries)

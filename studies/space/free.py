@@ -73,6 +73,11 @@ class FreeNumbers(NamedTuple):
         """Names of the numbers, in order."""
         return tuple(number.name for number in self.numbers)
 
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Fields that the numbers are in."""
+        return tuple(name.partition("[")[0] for name in self.names)
+
     def values(self, u: np.ndarray) -> np.ndarray:
         """Numbers in the study's units, (..., p), from their places between the bounds, 0 to 1."""
         columns = [free.span.at(u[..., k]) for k, free in enumerate(self.numbers)]

@@ -9,15 +9,10 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure, uncontrolled
 from jaxmodel.simulate import Result, simulate
+from studies.engine.fast_motion import make_fast
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
 from studies.study.spec import Study
-from studies.study.window import residual_delay
-
-#: The move has the acceleration of a move of this length in this time.
-FAST = (0.01, 0.03)  # [m], [s]
-#: Length of the residual window [s].
-WINDOW = 0.15
 
 
 class ControlEffect(NamedTuple):
@@ -63,22 +58,3 @@ def run_fast_move(study: Study) -> ControlEffect:
 @kept_jit(static_argnums=0)
 def _simulate(structure: Structure, cases: Case) -> Result:
     return jax.vmap(lambda case: simulate(structure, case))(cases)
-
-
-def make_fast(study: Study) -> Study:
-    """The same with only its first move, at the acceleration of `FAST`, without shaper."""
-    points = study.motion.waypoints[:2]
-    distance = float(np.hypot(*np.subtract(points[-1], points[0])[:2]))
-    time = study.motion.move_time
-    time = time if isinstance(time, float) else time[0]
-    if distance > 0:
-        time = max(FAST[1] * np.sqrt(distance / FAST[0]), 1e-3)
-    moving = time if len(points) > 1 else 0.0
-    fast = study.change(
-        motion__waypoints=points,
-        motion__move_time=float(time),
-        motion__dwell=0.0,
-        shaper__kind="none",
-        metrics__residual_length=WINDOW,
-    )
-    return fast.change(run__duration=moving + residual_delay(fast) + WINDOW + 0.01)

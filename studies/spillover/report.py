@@ -12,11 +12,12 @@ from jaxmodel import status
 from jaxmodel.laws import LAWS
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 from studies.engine.breaking import UNITS
+from studies.engine.fast_motion import FAST, WINDOW
 from studies.show.document import json_text
 from studies.show.pages import page
 from studies.show.sketch import CAPTION
 from studies.spillover.certificate import Certificate, Spillover
-from studies.spillover.fast_move import FAST, WINDOW, ControlEffect
+from studies.spillover.fast_move import ControlEffect
 from studies.spillover.plants import PlantVariant
 from studies.spillover.proofs import Proofs, machine_text, proof_texts
 from studies.study.labels import describe

@@ -16,6 +16,7 @@ class Board(NamedTuple):
     flags: tuple[str, ...]  # of the compiler
     real: str  # floating-point type that code in floating point is built for
     cycles: float  # of an instruction, assumed without wait states [1]
+    clock: float  # usual for it [Hz]
 
     def load(self, instructions: float, rate: float, clock: float) -> float:
         """Share of a sample period, estimated [1].
@@ -44,6 +45,7 @@ BOARDS: Table[Board] = Table(
             flags=("-mcpu=cortex-m3", "-mthumb"),
             real="float",
             cycles=2.0,
+            clock=72e6,
         ),
         Board(
             name="cortex-m4",
@@ -52,6 +54,7 @@ BOARDS: Table[Board] = Table(
             flags=("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=soft"),
             real="float",
             cycles=1.5,
+            clock=168e6,
         ),
         Board(
             name="cortex-m4f",
@@ -60,6 +63,7 @@ BOARDS: Table[Board] = Table(
             flags=("-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"),
             real="float",
             cycles=1.5,
+            clock=168e6,
         ),
         Board(
             name="cortex-m7",
@@ -68,6 +72,7 @@ BOARDS: Table[Board] = Table(
             flags=("-mcpu=cortex-m7", "-mthumb", "-mfpu=fpv5-d16", "-mfloat-abi=hard"),
             real="double",
             cycles=1.0,
+            clock=480e6,
         ),
     ],
 )

@@ -74,10 +74,10 @@ typedef {{ NAME }}_REAL {{ name }}_real;
 /* State of the controller. */
 typedef struct {
     {% if blocks %}
-    {{ word }} x[{{ NAME }}_N_STATES]; /* pairs that turn together */
+    {{ count }} x[{{ NAME }}_N_STATES]; /* pairs that turn together */
     {% else %}
-    {{ word }} high[{{ NAME }}_N_MODES]; /* memory of the first section */
-    {{ word }} line[{{ NAME }}_N_MODES][2]; /* delay line of the second section */
+    {{ count }} high[{{ NAME }}_N_MODES]; /* memory of the first section */
+    {{ count }} line[{{ NAME }}_N_MODES][2]; /* delay line of the second section */
     {% endif %}
     {% if has_feedthrough %}
     {{ word }} command[{{ NAME }}_N_CHANNELS]; /* on the actuators now */

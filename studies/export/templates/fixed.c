@@ -1,13 +1,15 @@
 {% import "export/templates/shared.c" as shared with context %}
+{% set wide = "int%d_t" % (2 * word_bits) %}
+{% set pose = "" if word_bits == 32 else "pose_" %}
 /* Controller and input shaper in fixed point, see {{ name }}.h.
  *
 {% for line in origin %}
  * {{ line }}
 {% endfor %}
  *
- * Every signal is a 32-bit integer; its unit is in the table of formats. A sum of products is formed
- * in 64 bits, without overflow (the coefficients of a row add up to less than 2^31), then
- * shifted right with rounding and limited to 32 bits. So coefficient = integer / 2^shift, and its
+ * Every signal is a {{ word_bits }}-bit integer; its unit is in the table of formats. A sum of products is formed
+ * in {{ 2 * word_bits }} bits, without overflow (the coefficients of a row add up to less than 2^{{ word_bits - 1 }}), then
+ * shifted right with rounding and limited to {{ word_bits }} bits. So coefficient = integer / 2^shift, and its
  * unit is counts of the result per count of what it multiplies.
  *
  * Formats: value = base * integer / 2^Q. The base is the largest value in the simulated motion; a
@@ -39,48 +41,48 @@ static const uint16_t ADC_TOP = {{ fixed.wires.adc_top }};
 static const int32_t ADC_UNIT = {{ 2 ** fixed.wires.adc_bits }};
 
 /* [count] sensor at rest; conditioner_bias */
-static const int64_t BIAS = {{ fixed.wires.bias }};
+static const {{ wide }} BIAS = {{ fixed.wires.bias }};
 
 /* [code] of 0 V at an actuator; the DAC's bits */
 static const int32_t DAC_REST = {{ fixed.wires.dac_rest }};
 
 {% if blocks %}
 /* [state/state] two of the pair, then [state/sensor] of the system's sensors; control.law */
-static const int32_t ADVANCE{{ array(advance, blocks.names) }};
+static const {{ count }} ADVANCE{{ array(advance, blocks.names) }};
 
 /* [bit] of each row */
 static const uint16_t ADVANCE_SHIFT{{ array(advance_shift) }};
 
 /* [code/state] of the system's states, then [code/sensor] of its sensors, for each actuator */
-static const int32_t LEAVE{{ array(leave, port_names) }};
+static const {{ count }} LEAVE{{ array(leave, port_names) }};
 
 /* [bit] of each row */
 static const uint16_t LEAVE_SHIFT{{ array(leave_shift) }};
 {% if has_anti_windup %}
 
 /* [state/code] of what the limits change on the system's actuators */
-static const int32_t ANTI_WINDUP{{ array(windup, blocks.names) }};
+static const {{ count }} ANTI_WINDUP{{ array(windup, blocks.names) }};
 
 /* [bit] of each row */
 static const uint16_t ANTI_WINDUP_SHIFT{{ array(windup_shift) }};
 {% endif %}
 {% else %}
 /* [signal/sensor] modal filter pinv(lambda_s Phi_s^t); control.basis, patches */
-static const int32_t FILTER{{ array(fixed.filter.integers, channels.names) }};
+static const {{ count }} FILTER{{ array(fixed.filter.integers, channels.names) }};
 
 /* [bit] of each row */
 static const uint16_t FILTER_SHIFT{{ array(fixed.filter.shift) }};
 
 /* [high/signal; high/signal, 1] b0; b1, -a1 of the velocity estimate's first section:
  * {{ shared.first_section() }} */
-static const int32_t HIGH_PASS{{ array(high_pass, channels.names) }};
+static const {{ count }} HIGH_PASS{{ array(high_pass, channels.names) }};
 
 /* [bit] of b0; of b1 and -a1 */
 static const uint16_t HIGH_PASS_SHIFT{{ array(high_pass_shift) }};
 
 /* [delay line/high, 1, 1] scale, -a1, -a2 of its second section:
  * {{ shared.second_section() }} */
-static const int32_t LOW_PASS{{ array(fixed.low_pass.integers, channels.names) }};
+static const {{ count }} LOW_PASS{{ array(fixed.low_pass.integers, channels.names) }};
 
 /* [bit] of each row */
 static const uint16_t LOW_PASS_SHIFT{{ array(fixed.low_pass.shift) }};
@@ -88,13 +90,13 @@ static const uint16_t LOW_PASS_SHIFT{{ array(fixed.low_pass.shift) }};
 /* [force/delay line] its numerator times the gains, -k_d n_v - k_p n_x;
  * control.gain_factor, velocity_gain, position_gain, ratios, gain_unit,
  * or damping, pole_decay, pole_frequency_hz */
-static const int32_t FORCE{{ array(force, channels.names) }};
+static const {{ count }} FORCE{{ array(force, channels.names) }};
 
 /* [bit] of each row */
 static const uint16_t FORCE_SHIFT{{ array(fixed.numerator.shift) }};
 
 /* [code/force] of each actuator of the link, pinv(lambda_a Phi_a); control.basis, patches */
-static const int32_t SYNTHESIZER{{ array(synthesizer, channels.names) }};
+static const {{ count }} SYNTHESIZER{{ array(synthesizer, channels.names) }};
 
 /* [bit] of each actuator */
 static const uint16_t SYNTHESIZER_SHIFT{{ array(fixed.synthesizer.shift.ravel()) }};
@@ -109,7 +111,7 @@ static const int WEIGHT_SHIFT = {{ weight_shift }};
 {{ shared.rivals() }}
 
 /* [energy root/delay line; energy root/signal] modal velocity, omega position */
-static const int32_t ENERGY{{ array(energy, energy_names) }};
+static const {{ count }} ENERGY{{ array(energy, energy_names) }};
 
 /* [bit] of each row */
 static const uint16_t ENERGY_SHIFT{{ array(fixed.energy.shift.ravel()) }};
@@ -117,35 +119,40 @@ static const uint16_t ENERGY_SHIFT{{ array(fixed.energy.shift.ravel()) }};
 {% if not blocks and channels.has_direct %}
 
 /* [force/signal] force past the filters, shifted as FORCE; control.position_gain */
-static const int32_t DIRECT{{ array(direct) }};
+static const {{ count }} DIRECT{{ array(direct) }};
 {% endif %}
 {% if has_feedthrough %}
 
 /* [sensor/code] of each actuator of the link, through uncontrolled modes;
  * control.feedthrough_factor */
-static const int32_t FEEDTHROUGH{{ array(feedthrough, patches) }};
+static const {{ count }} FEEDTHROUGH{{ array(feedthrough, patches) }};
 
 /* [bit] of each row */
 static const uint16_t FEEDTHROUGH_SHIFT{{ array(fixed.wires.feedthrough.shift.ravel()) }};
 {% endif %}
 
-static int32_t limited(int64_t x)
+{% macro arithmetic(prefix, count, sum, bits) %}
+static {{ count }} {{ prefix }}limited({{ sum }} x)
 {
-    return x > INT32_MAX ? INT32_MAX : x < INT32_MIN ? INT32_MIN : (int32_t)x;
-}
-
-/* A command within the DAC's codes. */
-static int32_t within(int64_t command)
-{
-    const int64_t most = DAC_REST - 1;
-
-    return (int32_t)(command > most ? most : command < -most ? -most : command);
+    return x > INT{{ bits }}_MAX ? INT{{ bits }}_MAX : x < INT{{ bits }}_MIN ? INT{{ bits }}_MIN : ({{ count }})x;
 }
 
 /* Round to nearest, halves up. Needs a right shift that keeps the sign; all compilers have it. */
-static int64_t shifted(int64_t sum, int shift)
+static {{ sum }} {{ prefix }}shifted({{ sum }} sum, int shift)
 {
-    return (sum + ((int64_t)1 << (shift - 1))) >> shift;
+    return (sum + (({{ sum }})1 << (shift - 1))) >> shift;
+}
+{% endmacro %}
+{{ arithmetic("", count, wide, word_bits) }}
+{% if word_bits != 32 %}
+{{ arithmetic("pose_", "int32_t", "int64_t", 32) }}
+{% endif %}
+/* A command within the DAC's codes. */
+static int32_t within({{ wide }} command)
+{
+    const {{ wide }} most = DAC_REST - 1;
+
+    return (int32_t)(command > most ? most : command < -most ? -most : command);
 }
 
 /* Whether a sensor is faulty: its number from 1, else 0. */
@@ -181,16 +188,16 @@ static int check({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_CHA
 int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_CHANNELS],
     uint16_t actuator[{{ NAME }}_N_CHANNELS])
 {
-    int32_t sensed[{{ NAME }}_N_CHANNELS]; /* sensor signals */
+    {{ count }} sensed[{{ NAME }}_N_CHANNELS]; /* sensor signals */
     {% if blocks %}
-    int64_t wanted[{{ NAME }}_N_CHANNELS]; /* codes, without limits */
+    {{ wide }} wanted[{{ NAME }}_N_CHANNELS]; /* codes, without limits */
     {% else %}
-    int32_t force[{{ NAME }}_N_MODES]; /* channel forces */
+    {{ count }} force[{{ NAME }}_N_MODES]; /* channel forces */
     {% endif %}
     {% if fixed.energy %}
-    int64_t energy[{{ NAME }}_N_MODES]; /* of the channels */
+    {{ wide }} energy[{{ NAME }}_N_MODES]; /* of the channels */
     {% endif %}
-    int64_t sum;
+    {{ wide }} sum;
     int k, m{{ ", s" if blocks }}{{ ", first" if has_first }};
 
     if (!state->fault) {
@@ -205,7 +212,7 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
     }
     for (k = 0; k < {{ NAME }}_N_CHANNELS; k++) {
         if (IS_USED[k / {{ NAME }}_N_PATCHES]) {
-            sensed[k] = limited((int64_t)sensor[k] * ADC_UNIT - BIAS);
+            sensed[k] = limited(({{ wide }})sensor[k] * ADC_UNIT - BIAS);
         }
     }
     {% if has_feedthrough %}
@@ -213,7 +220,7 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
         first = {{ NAME }}_N_PATCHES * (k / {{ NAME }}_N_PATCHES);
         sum = 0;
         for (m = 0; IS_USED[k / {{ NAME }}_N_PATCHES] && m < {{ NAME }}_N_PATCHES; m++) {
-            sum += (int64_t)FEEDTHROUGH[k][m] * state->command[first + m];
+            sum += ({{ wide }})FEEDTHROUGH[k][m] * state->command[first + m];
         }
         if (IS_USED[k / {{ NAME }}_N_PATCHES]) {
             sensed[k] = limited(sensed[k] - shifted(sum, FEEDTHROUGH_SHIFT[k]));
@@ -228,10 +235,10 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
         }
     }
     for (s = 0; s < N_SYSTEMS; s++) {
-        const int32_t *in = sensed + FIRST[s];
-        int32_t *x = state->x + s * ORDER;
+        const {{ count }} *in = sensed + FIRST[s];
+        {{ count }} *x = state->x + s * ORDER;
         {% if has_anti_windup %}
-        int32_t change[N_PORTS]; /* of the demands, by the limits [code] */
+        {{ count }} change[N_PORTS]; /* of the demands, by the limits [code] */
         {% endif %}
 
         for (k = 0; k < N_PORTS; k++) {
@@ -239,10 +246,10 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
 
             sum = 0;
             for (m = 0; m < ORDER; m++) {
-                sum += (int64_t)LEAVE[row][m] * x[m];
+                sum += ({{ wide }})LEAVE[row][m] * x[m];
             }
             for (m = 0; m < N_PORTS; m++) {
-                sum += (int64_t)LEAVE[row][ORDER + m] * in[m];
+                sum += ({{ wide }})LEAVE[row][ORDER + m] * in[m];
             }
             wanted[FIRST[s] + k] = shifted(sum, LEAVE_SHIFT[row]);
             {% if has_anti_windup %}
@@ -250,23 +257,23 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
             {% endif %}
         }
         for (m = 0; m < ORDER; m += 2) {
-            int32_t next[2];
+            {{ count }} next[2];
 
             for (k = 0; k < 2; k++) {
                 const int row = s * ORDER + m + k;
                 int port;
 
-                sum = (int64_t)ADVANCE[row][0] * x[m] + (int64_t)ADVANCE[row][1] * x[m + 1];
+                sum = ({{ wide }})ADVANCE[row][0] * x[m] + ({{ wide }})ADVANCE[row][1] * x[m + 1];
                 for (port = 0; port < N_PORTS; port++) {
-                    sum += (int64_t)ADVANCE[row][2 + port] * in[port];
+                    sum += ({{ wide }})ADVANCE[row][2 + port] * in[port];
                 }
                 {% if has_anti_windup %}
                 sum = shifted(sum, ADVANCE_SHIFT[row]);
                 {
-                    int64_t told = 0;
+                    {{ wide }} told = 0;
 
                     for (port = 0; port < N_PORTS; port++) {
-                        told += (int64_t)ANTI_WINDUP[row][port] * change[port];
+                        told += ({{ wide }})ANTI_WINDUP[row][port] * change[port];
                     }
                     next[k] = limited(sum + shifted(told, ANTI_WINDUP_SHIFT[row]));
                 }
@@ -280,35 +287,35 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
     }
     {% else %}
     for (m = 0; m < {{ NAME }}_N_MODES; m++) {
-        int32_t signal, high, inner;
-        int32_t *line = state->line[m];
+        {{ count }} signal, high, inner;
+        {{ count }} *line = state->line[m];
 
         first = {{ NAME }}_N_PATCHES * LINK[m];
         sum = 0;
         for (k = 0; k < {{ NAME }}_N_PATCHES; k++) {
-            sum += (int64_t)FILTER[m][k] * sensed[first + k];
+            sum += ({{ wide }})FILTER[m][k] * sensed[first + k];
         }
         signal = limited(shifted(sum, FILTER_SHIFT[m]));
-        sum = shifted((int64_t)HIGH_PASS[m][0] * signal, HIGH_PASS_SHIFT[m][0]);
+        sum = shifted(({{ wide }})HIGH_PASS[m][0] * signal, HIGH_PASS_SHIFT[m][0]);
         high = limited(sum + state->high[m]);
-        sum = (int64_t)HIGH_PASS[m][1] * signal + (int64_t)HIGH_PASS[m][2] * high;
+        sum = ({{ wide }})HIGH_PASS[m][1] * signal + ({{ wide }})HIGH_PASS[m][2] * high;
         state->high[m] = limited(shifted(sum, HIGH_PASS_SHIFT[m][1]));
-        sum = (int64_t)LOW_PASS[m][0] * high + (int64_t)LOW_PASS[m][1] * line[0]
-            + (int64_t)LOW_PASS[m][2] * line[1];
+        sum = ({{ wide }})LOW_PASS[m][0] * high + ({{ wide }})LOW_PASS[m][1] * line[0]
+            + ({{ wide }})LOW_PASS[m][2] * line[1];
         inner = limited(shifted(sum, LOW_PASS_SHIFT[m]));
-        sum = (int64_t)FORCE[m][0] * inner + (int64_t)FORCE[m][1] * line[0]
-            + (int64_t)FORCE[m][2] * line[1]
+        sum = ({{ wide }})FORCE[m][0] * inner + ({{ wide }})FORCE[m][1] * line[0]
+            + ({{ wide }})FORCE[m][2] * line[1]
             {%- if channels.has_direct +%}
-            + (int64_t)DIRECT[m] * signal
+            + ({{ wide }})DIRECT[m] * signal
             {%- endif %};
         force[m] = limited(shifted(sum, FORCE_SHIFT[m]));
         {% if fixed.energy %}
         energy[m] = 0;
         for (k = 0; k < 2; k++) {
-            int64_t part;
+            {{ wide }} part;
 
-            sum = (int64_t)ENERGY[2 * m + k][0] * inner + (int64_t)ENERGY[2 * m + k][1] * line[0]
-                + (int64_t)ENERGY[2 * m + k][2] * line[1] + (int64_t)ENERGY[2 * m + k][3] * signal;
+            sum = ({{ wide }})ENERGY[2 * m + k][0] * inner + ({{ wide }})ENERGY[2 * m + k][1] * line[0]
+                + ({{ wide }})ENERGY[2 * m + k][2] * line[1] + ({{ wide }})ENERGY[2 * m + k][3] * signal;
             part = limited(shifted(sum, ENERGY_SHIFT[2 * m + k]));
             energy[m] += part * part;
         }
@@ -334,7 +341,7 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
         {% else %}
         sum = 0;
         for (m = FIRST_MODE[k / {{ NAME }}_N_PATCHES]; m < FIRST_MODE[k / {{ NAME }}_N_PATCHES + 1]; m++) {
-            sum += (int64_t)SYNTHESIZER[m][k % {{ NAME }}_N_PATCHES] * force[m];
+            sum += ({{ wide }})SYNTHESIZER[m][k % {{ NAME }}_N_PATCHES] * force[m];
         }
         command = within(shifted(sum, SYNTHESIZER_SHIFT[k]));
         {% endif %}
@@ -366,6 +373,6 @@ void {{ name }}_shape_step({{ name }}_shaper *shaper, const int32_t reference[3]
         }
     }
     for (axis = 0; axis < 3; axis++) {
-        shaped[axis] = limited(shifted(sum[axis], WEIGHT_SHIFT));
+        shaped[axis] = {{ pose }}limited({{ pose }}shifted(sum[axis], WEIGHT_SHIFT));
     }
 }

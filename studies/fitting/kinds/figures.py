@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -56,13 +57,13 @@ class Runs:
     All figures share them: one program runs every combination that any of them needs.
     """
 
-    def __init__(self, study: Study, place: Place) -> None:
-        """Arguments: what all runs share, and what puts parameters among them.
+    def __init__(self, study: Study, place: Place, moving: Sequence[str]) -> None:
+        """Arguments: what all runs share, what puts parameters among them, and their fields.
 
         Raises:
             StudyError: as `check_run`.
         """
-        self._structure, self._numbers = smooth_run(study)
+        self._structure, self._numbers = smooth_run(study, moving)
         self._place = place
         self._metrics: set[str] = set()
         self._switches: list[Switch] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +17,7 @@ from studies.engine.programs import kept_jit
 from studies.errors import StudyError
 from studies.fitting.bench import with_outputs_at, with_slopes
 from studies.space.free import Place
-from studies.study.cases import as_arrays, case_of
+from studies.study.cases import as_arrays, case_of, with_used
 from studies.study.labels import describe
 from studies.study.numbers import Numbers, one_study
 from studies.study.signals import Signal
@@ -45,13 +46,20 @@ class Recording(NamedTuple):
 class Motion:
     """A study's run with some links under control, kept for the last parameters."""
 
-    def __init__(self, study: Study, place: Place, places: tuple[float, ...]) -> None:
-        """Arguments: the run, what puts parameters among the numbers, and its stations [m], if any.
+    def __init__(
+        self, study: Study, place: Place, places: tuple[float, ...], moving: Sequence[str]
+    ) -> None:
+        """
+        Args:
+            study: the run.
+            place: puts parameters among the numbers.
+            places: its stations [m], if any.
+            moving: fields of the parameters, which may be 0 in the study.
 
         Raises:
             StudyError: as `check_run`.
         """
-        self._structure, self._numbers = smooth_run(study)
+        self._structure, self._numbers = smooth_run(study, moving)
         self._place, self._places = place, places
         self._kinds: set[str] = set()
         self._kept: tuple[Any, Any] = None, None
@@ -92,29 +100,31 @@ class Motion:
 class Motions:
     """Recorded runs of one study, by the links under control."""
 
-    def __init__(self, study: Study, place: Place, places: tuple[float, ...]) -> None:
-        """Arguments: as `Motion`; and where deflections are measured [m]."""
+    def __init__(
+        self, study: Study, place: Place, places: tuple[float, ...], moving: Sequence[str]
+    ) -> None:
+        """Arguments: as `Motion`; where deflections are measured [m]; fields that move."""
         self._study, self._place = (
             with_outputs_at(study, place, places) if places else (study, place)
         )
-        self._places = places
+        self._places, self._moving = places, moving
         self._known: dict[tuple[bool, ...] | None, Motion] = {}
 
     def of(self, links: tuple[bool, ...] | None) -> Motion:
         """The run with these links under control; None: those of the study."""
         if links not in self._known:
             study = self._study if links is None else self._study.change(control__links=links)
-            self._known[links] = Motion(study, self._place, self._places)
+            self._known[links] = Motion(study, self._place, self._places, self._moving)
         return self._known[links]
 
 
-def smooth_run(study: Study) -> tuple[Structure, Numbers]:
-    """A study's run with derivatives.
+def smooth_run(study: Study, moving: Sequence[str]) -> tuple[Structure, Numbers]:
+    """A study's run with derivatives by some fields, which may be 0 in it.
 
     Raises:
         StudyError: as `check_run`.
     """
-    structure = check_run(study)[0]._replace(is_smooth=True)
+    structure = with_used(check_run(study)[0], moving)._replace(is_smooth=True)
     return structure, as_arrays(one_study(study, structure))
 
 

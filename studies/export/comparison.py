@@ -1,0 +1,299 @@
+"""One controller in several arithmetics and at several sample rates: what each would cost."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.console import Console
+
+from studies.engine.controller import FixedController, check_codable, fixed_controller
+from studies.engine.design import Design
+from studies.engine.fast_motion import find_motion
+from studies.errors import StudyError
+from studies.export.c_fixed import fixed_source
+from studies.export.c_floating import floating_source
+from studies.export.c_text import Source
+from studies.export.compiler import NO_COMPILER, find_compiler
+from studies.export.firmware.boards import Board
+from studies.export.firmware.build import Built, build
+from studies.export.firmware.emulator import EmulatedCode, emulated
+from studies.export.firmware.project import project_files, write_files
+from studies.export.fixed import ALLOWED_ERROR, check_words
+from studies.export.fixed_blocks import design_integers
+from studies.export.floating import respond
+from studies.export.in_the_loop import LoopRun, run_in_the_loop
+from studies.export.job import check_loop
+from studies.export.run import checked_bits, checked_board
+from studies.export.verify import load_code, reference_run
+from studies.publish import announce, check_folder, publish, shown
+from studies.show.document import json_text
+from studies.show.pages import page
+from studies.study.margin import margin_text
+from studies.study.spec import Study
+
+PAGE, DOCUMENT = "comparison.html", "comparison.json"
+#: Sample rates [Hz], and bits of a word in fixed point; 0: single precision.
+RATES = (5e3, 10e3, 20e3)
+WORDS = (0, 32, 16)
+NAME = "flexlink"
+
+
+class Variant(NamedTuple):
+    """A controller at a sample rate in one arithmetic."""
+
+    rate: float  # [Hz]
+    word: int  # bits of a word; 0: single precision
+    fault: str = ""  # why there is no such controller
+    margin: float = np.nan  # gain margin with its coefficients [1]
+    residual: float = np.nan  # rms of the worst link after the motion [m]
+    rounding: float = 0.0  # bound on the error at an actuator, in DAC steps [1]
+    instructions: int | None = None  # of the costliest sample; None: not emulated
+    load: float | None = None  # share of a sample period at the board's usual clock [1]
+    flash: int | None = None  # code and constants [bytes]
+
+    @property
+    def arithmetic(self) -> str:
+        """In words."""
+        return f"{self.word}-bit fixed point" if self.word else "single precision"
+
+    @property
+    def is_exportable(self) -> bool:
+        """Whether `studies export` would write it."""
+        return not self.fault and self.word in (0, 32) and self.rounding <= ALLOWED_ERROR
+
+
+class ComparedVariants(NamedTuple):
+    """All variants of a controller."""
+
+    out: Path
+    study: Study
+    motion: str  # why it is not the study's own one, "" if it is
+    board: Board | None
+    dac_bits: int
+    variants: tuple[Variant, ...]
+
+    def _repr_html_(self) -> str:
+        return shown(self)
+
+
+def compare_variants(
+    design: Design,
+    out: str | Path,
+    dac_bits: int | None = None,
+    pil: str | None = None,
+    console: Console | None = None,
+) -> ComparedVariants:
+    """Export a controller in every arithmetic at every sample rate, for a table, not for use.
+
+    Args:
+        design: whose controller; its sample rate is replaced.
+        out: folder for the page and the document.
+        dac_bits: resolution of the DAC behind all of them; None: the usual one.
+        pil: emulated processor that counts instructions; None: they are not counted.
+        console: where messages go; default: standard output.
+
+    Raises:
+        StudyError: an argument out of range, no compiler or controller, or a folder that cannot
+            be written to.
+    """
+    console = console or Console(highlight=False, markup=False)
+    bits, board = checked_bits(dac_bits), checked_board(pil)
+    out, compiler = Path(out), find_compiler()
+    check_folder(out)
+    if not compiler:
+        raise StudyError(f"--compare: {NO_COMPILER}")
+    check_codable(design.study)
+    motion = find_motion(design.study)
+    if motion.text:
+        console.print(motion.text, soft_wrap=True)
+    variants: list[Variant] = []
+    for rate in RATES:
+        for variant in _at_rate(motion.study, rate, bits, board, compiler):
+            console.print(": ".join((f"{rate:g} Hz, {variant.arithmetic}", _verdict(variant))))
+            variants.append(variant)
+    found = ComparedVariants(out, design.study, motion.text, board, bits, tuple(variants))
+    with publish(out) as staging:
+        (staging / PAGE).write_text(_page(found), encoding="utf-8")
+        (staging / DOCUMENT).write_text(_document(found), encoding="utf-8")
+    announce(console, out / PAGE)
+    return found
+
+
+def _at_rate(
+    study: Study, rate: float, dac_bits: int, board: Board | None, compiler: list[str]
+) -> Iterator[Variant]:
+    """The variants of one sample rate."""
+    try:
+        study = study.change(electronics__sample_rate_hz=rate)
+        exported = fixed_controller(study)
+        loop = check_loop(exported, exported.channels, "")
+        codes = reference_run(exported).codes
+    except StudyError as error:
+        yield from (Variant(rate, word, fault=str(error)) for word in WORDS)
+        return
+    at = _At(exported, codes, dac_bits, board, compiler, float(loop.gain_margin))
+    for word in WORDS:
+        try:
+            yield _fixed(at, rate, word) if word else _floating(at, rate)
+        except StudyError as error:
+            yield Variant(rate, word, fault=str(error))
+
+
+class _At(NamedTuple):
+    """What the variants of one sample rate have in common."""
+
+    exported: FixedController
+    codes: np.ndarray  # of the ADC with the JAX controller, (T, 3, K)
+    dac_bits: int
+    board: Board | None
+    compiler: list[str]
+    margin: float  # with exact coefficients [1]
+
+    @property
+    def dac_step(self) -> float:
+        """[V]."""
+        return float(self.exported.controller.voltage_limit) / (2 ** (self.dac_bits - 1) - 1)
+
+
+def _floating(at: _At, rate: float) -> Variant:
+    exported, scale = at.exported, float(at.exported.controller.adc_step)
+    source, step = floating_source(exported, NAME, []), at.dac_step
+    with load_code(exported, source, NAME, at.compiler, np.float32, np.float32) as code:
+        code.begin()
+
+        def law(codes: np.ndarray) -> np.ndarray:
+            volts = code.step(codes * scale)[0].reshape(codes.shape).astype(float)
+            return np.asarray(np.round(volts / step) * step)
+
+        run = run_in_the_loop(exported.structure, exported.case, law)
+    variant = Variant(rate, 0, margin=at.margin, residual=_residual(run))
+    return _with_cost(at, variant, source, at.codes * scale)
+
+
+def _fixed(at: _At, rate: float, word: int) -> Variant:
+    exported = at.exported
+    check_words(exported)
+    signals = respond(exported.channels, exported.controller, at.codes)
+    fixed, near = design_integers(exported, signals, at.dac_bits, word)
+    loop = check_loop(exported, near, f", coefficients rounded to {word} bits")
+    source, wires = fixed_source(exported, fixed, NAME, [], ""), fixed.wires
+    with load_code(exported, source, NAME, at.compiler, np.uint16, np.int32) as code:
+        code.begin()
+
+        def law(codes: np.ndarray) -> np.ndarray:
+            values = code.step(codes)[0].reshape(codes.shape).astype(float)
+            return (values - wires.dac_rest) * wires.dac_step
+
+        run = run_in_the_loop(exported.structure, exported.case, law)
+    variant = Variant(
+        rate,
+        word,
+        margin=float(loop.gain_margin),
+        residual=_residual(run),
+        rounding=float(fixed.error.inside.max() / wires.dac_step),
+    )
+    return _with_cost(at, variant, source, at.codes)
+
+
+def _residual(run: LoopRun) -> float:
+    return float(np.max(run.result.metrics.residual_rms))
+
+
+def _with_cost(at: _At, variant: Variant, source: Source, sensor: np.ndarray) -> Variant:
+    """With instructions and flash, if there is a processor."""
+    if at.board is None:
+        return variant
+    with _emulation(source, at.board, bool(variant.word)) as (built, processor):
+        processor.respond(sensor)
+        most = int(processor.instructions[-1].max())
+    load = at.board.load(most, variant.rate, at.board.clock)
+    return variant._replace(instructions=most, load=load, flash=built.flash)
+
+
+@contextmanager
+def _emulation(
+    source: Source, board: Board, is_fixed: bool
+) -> Iterator[tuple[Built, EmulatedCode]]:
+    """The code, built for a processor and running on it."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_files(project_files(source, NAME, board, is_fixed), Path(folder))
+        built = build(Path(folder), NAME, board, is_fixed)
+        with emulated(built.image, board) as processor:
+            yield built, processor
+
+
+def _verdict(x: Variant) -> str:
+    """What speaks for or against a variant, in words."""
+    if x.fault:
+        return f"none: {x.fault}"
+    text = f"gain margin {margin_text(x.margin, 3)}, residual vibration {1e6 * x.residual:.3g} µm"
+    if x.rounding > ALLOWED_ERROR:
+        return f"{text}, but rounding of up to {x.rounding:.3g} DAC steps"
+    return text
+
+
+def _rows(found: ComparedVariants) -> list[list[str]]:
+    """Row of the table of each variant."""
+    rows = []
+    for x in found.variants:
+        start = [f"{x.rate / 1e3:g}", x.arithmetic]
+        if x.fault:
+            rows.append([*start, *[""] * (3 if found.board is None else 6), f"none: {x.fault}"])
+            continue
+        figures = [margin_text(x.margin, 3), f"{1e6 * x.residual:.4g}"]
+        figures.append(f"{x.rounding:.3g}" if x.word else "")
+        if found.board is not None and x.load is not None:
+            figures += [str(x.instructions), f"{100 * x.load:.0f} %", str(x.flash)]
+        what = "studies export writes it" if x.is_exportable else _refusal(x)
+        rows.append([*start, *figures, what])
+    return rows
+
+
+def _refusal(x: Variant) -> str:
+    if x.rounding > ALLOWED_ERROR:
+        return f"not written: rounding above {ALLOWED_ERROR:g} DAC steps"
+    return "not written: words of 16 bits are only compared"
+
+
+def _page(found: ComparedVariants) -> str:
+    usable = [x for x in found.variants if x.is_exportable and (x.load is None or x.load < 1)]
+    return page(
+        "export/comparison.html",
+        None,
+        found.study,
+        found=found,
+        rows=_rows(found),
+        usable=len(usable),
+        allowed=ALLOWED_ERROR,
+    )
+
+
+def _document(found: ComparedVariants) -> str:
+    whole = {
+        "title": found.study.title,
+        "motion": found.motion,
+        "processor": "" if found.board is None else found.board.name,
+        "dac_bits": found.dac_bits,
+        "variants": [_described(x) for x in found.variants],
+    }
+    return json_text("comparison", whole)
+
+
+def _described(x: Variant) -> dict[str, Any]:
+    return {
+        "sample_rate_hz": x.rate,
+        "arithmetic": x.arithmetic,
+        "is_exportable": x.is_exportable,
+        "fault": x.fault,
+        "gain_margin": x.margin,
+        "residual_rms": x.residual,
+        "rounding": x.rounding,
+        "instructions": x.instructions,
+        "load": x.load,
+        "flash": x.flash,
+    }
