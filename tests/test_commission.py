@@ -132,6 +132,7 @@ class Pretended:
         monkeypatch.setattr(commissioning, "certificate_document", lambda out: self._certificate())
         tuned = type("Tuned", (), {"study": STUDY})
         monkeypatch.setattr(commissioning, "tuned_design", lambda out: tuned)
+        monkeypatch.setattr(commissioning, "has_fast_motion", lambda out, tuned: True)
 
     def _certificate(self):
         is_passed = self.answers["is_passed"]
@@ -145,7 +146,7 @@ class Pretended:
             if self.answers.get("stops") == stage.name:
                 raise KeyboardInterrupt
             (out / stage.name).mkdir()
-            (out / stage.name / stage.last[0]).write_text("{}")
+            (out / stage.last[0]).write_text("{}")
 
         return make
 
@@ -168,6 +169,7 @@ def test_all_stages_lead_to_firmware(monkeypatch, tmp_path):
     made, text, page = commissioned(tmp_path / "out")
     assert made.is_good and stages.calls == ["fit", "tune", "certificate", "firmware"]
     assert "gain margin 2.5 or more on 2 machines" in text and "link.youngs_modulus 7e+10" in text
+    assert "tuned on a fast first move without shaper" in text
     assert "commissioned" in page and "firmware/verification.html" in page
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from studies.commission.spec import MeasuredSpec
 from studies.commission.stages import STAGES
+from studies.engine.fast_motion import LEAST_STEPS
 from studies.fitting.spec import number_unit
 from studies.show.document import json_text
 from studies.show.pages import page
@@ -24,6 +25,7 @@ class CommissionFindings(NamedTuple):
     refusals: tuple[str, ...] = ()  # why there is no firmware to use; none if there is
     fit: dict[str, Any] | None = None
     tuned: Study | None = None
+    is_fast: bool = False  # whether it was tuned on a faster motion than its own
     margins: np.ndarray | None = None  # on machines that the data leave possible [1], (n,)
     certificate: dict[str, Any] | None = None
 
@@ -53,6 +55,11 @@ def chosen_text(outcome: CommissionFindings) -> str:
         return "Chosen: nothing."
     control, rate = outcome.tuned.control, outcome.tuned.electronics.sample_rate_hz
     gain = f"gain factor {control.gain_factor:.4g}, {rate:g} Hz"
+    if outcome.is_fast:
+        gain += (
+            f", tuned on a fast first move without shaper, because the motion of the file leaves "
+            f"less than {LEAST_STEPS:g} ADC steps even without control"
+        )
     if outcome.refusals:
         return f"Chosen, but not to be used: {control.law}, {gain}."
     return f"Chosen: {control.law}, {gain}; the code is in {outcome.out / 'firmware'}."

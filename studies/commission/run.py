@@ -21,6 +21,7 @@ from studies.commission.stages import (
     Stage,
     certificate_document,
     fit_document,
+    has_fast_motion,
     is_verified,
     possible_machines,
     tuned_design,
@@ -142,7 +143,9 @@ def _judge_tuned(
 ) -> CommissionFindings:
     """The gain margins of its controller on all possible machines."""
     margins = _margins(outcome.out, console)
-    outcome = outcome._replace(tuned=tuned_design(outcome.out).study, margins=margins)
+    tuned = tuned_design(outcome.out).study
+    is_fast = has_fast_motion(outcome.out, tuned)
+    outcome = outcome._replace(tuned=tuned, is_fast=is_fast, margins=margins)
     low = int(np.sum(margins < wanted))
     text = (
         f"on {low} of {len(margins)} machines that the data leave possible the gain margin "

@@ -138,6 +138,11 @@ def tuned_design(out: Path) -> Design:
     return load_design(out / DESIGN)
 
 
+def has_fast_motion(out: Path, tuned: Study) -> bool:
+    """Whether a controller was tuned on a faster motion than its own."""
+    return load_design(out / "tune").study.motion != tuned.motion
+
+
 def possible_machines(out: Path) -> Possible:
     """Machines that the data leave possible."""
     with open_hdf5(out / "fit" / DATA) as file:

@@ -116,7 +116,14 @@ def compare_variants(
         for variant in _at_rate(motion.study, rate, bits, board, compiler):
             console.print(": ".join((f"{rate:g} Hz, {variant.arithmetic}", _verdict(variant))))
             variants.append(variant)
-    found = ComparedVariants(out, design.study, motion.text, board, bits, tuple(variants))
+    found = ComparedVariants(
+        out=out,
+        study=design.study,
+        motion=motion.text,
+        board=board,
+        dac_bits=bits,
+        variants=tuple(variants),
+    )
     with publish(out) as staging:
         (staging / PAGE).write_text(_page(found), encoding="utf-8")
         (staging / DOCUMENT).write_text(_document(found), encoding="utf-8")
@@ -136,7 +143,14 @@ def _at_rate(
     except StudyError as error:
         yield from (Variant(rate, word, fault=str(error)) for word in WORDS)
         return
-    at = _At(exported, codes, dac_bits, board, compiler, float(loop.gain_margin))
+    at = _At(
+        exported=exported,
+        codes=codes,
+        dac_bits=dac_bits,
+        board=board,
+        compiler=compiler,
+        margin=float(loop.gain_margin),
+    )
     for word in WORDS:
         try:
             yield _fixed(at, rate, word) if word else _floating(at, rate)
