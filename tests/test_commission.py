@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from studies.commission import run as commissioning
-from studies.commission.machines import Possible, margins_on, unknown_to_controller
+from studies.commission.machines import Possible, margin_spread, margins_on, unknown_to_controller
 from studies.commission.report import CommissionFindings, summary
 from studies.commission.run import run_commission
 from studies.commission.spec import LONGER, RESERVE, parse_measured, tuning_section
@@ -96,6 +96,15 @@ def test_margins_are_those_of_the_fixed_controller_on_each_machine():
     np.testing.assert_allclose(found[:2], wanted[:2], rtol=1e-9)
     assert abs(found[2] / wanted[2] - 1) > 1e-3  # not the controller made for that machine
     assert found[3] == 0  # there is none
+
+
+def test_the_spread_of_margins_is_that_of_possible_machines():
+    """A softer or a harder link moves the margin of a fixed controller either way."""
+    names, moduli = ("link.youngs_modulus",), np.array([[66e9], [70e9], [74e9]])
+    margins = margins_on(Possible(names, moduli), STUDY)
+    spread = margin_spread(Possible(names, moduli), STUDY)
+    assert spread == pytest.approx(margins[1] / margins.min(), rel=1e-9) and spread > 1.001
+    assert margin_spread(Possible(names, np.array([[-1.0]])), STUDY) == 1  # there is none
 
 
 # --- stages ---------------------------------------------------------------------------------------

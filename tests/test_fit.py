@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import pyuff
+import scipy
 from rich.console import Console
 from scipy.stats import chi2
 
@@ -500,6 +501,38 @@ def test_damaged_files_and_columns_nobody_asked_for(tmp_path):
     (tmp_path / "b.uff").write_text("    -1\n    58\n garbage\n    -1\n")
     with pytest.raises(StudyError, match="cannot be read"):
         read_columns("b.uff", tmp_path, "file")
+
+
+@pytest.mark.parametrize("mark", [";", "\t"])
+def test_columns_are_separated_by_semicolons_or_tabs(mark, tmp_path):
+    rows = [["# from a logger"], ["time", "value"], ["0", "1.5"], ["0.5", "-2e-3"]]
+    (tmp_path / "a.csv").write_text("\n".join(mark.join(row) for row in rows) + "\n\n")
+    if mark == ";":  # as written where decimals have commas
+        text = (tmp_path / "a.csv").read_text()
+        (tmp_path / "b.csv").write_text(text.replace(".", ","))
+    for name in ("a.csv", "b.csv")[: 2 if mark == ";" else 1]:
+        found = numbers_of(read_columns(name, tmp_path, "file"))
+        assert found["time"].tolist() == [0.0, 0.5] and found["value"].tolist() == [1.5, -2e-3]
+
+
+def test_columns_come_from_matlab(tmp_path):
+    f, h = FREQUENCY, np.exp(0.01j * FREQUENCY)
+    inner = {"frequency_hz": f[:, None], "real": h, "note": "hammer"}
+    scipy.io.savemat(tmp_path / "a.mat", {"run1": inner, **inner, "gain": 2.0})
+    with h5py.File(tmp_path / "b.mat", "w") as file:  # as version 7.3 has it
+        whole = np.empty(len(h), [("real", float), ("imag", float)])
+        whole["real"], whole["imag"] = h.real, h.imag
+        for at in (file, file.create_group("run1")):
+            at["frequency_hz"], at["real"], at["gain"] = f[None], whole[None], [[2.0]]
+    for name in ("a.mat", "a.mat::run1", "b.mat", "b.mat::run1"):
+        found = read_columns(name, tmp_path, "file")
+        np.testing.assert_array_equal(column(found, "frequency_hz", name, "file"), f)
+        np.testing.assert_array_equal(column(found, "real", name, "file"), h)
+    with pytest.raises(StudyError, match="has no struct run2"):
+        read_columns("a.mat::run2", tmp_path, "file")
+    (tmp_path / "c.mat").write_bytes(b"MATLAB 5.0 MAT-file" + bytes(range(256)) * 2)
+    with pytest.raises(StudyError, match="cannot be read"):
+        read_columns("c.mat", tmp_path, "file")
 
 
 def test_columns_come_from_three_formats(tmp_path):

@@ -60,6 +60,20 @@ def unknown_to_controller(possible: Possible, study: Study) -> dict[str, list[fl
     return columns
 
 
+def margin_spread(possible: Possible, study: Study) -> float:
+    """Gain margin of a study's fixed controller on its own machine over the least on others [1].
+
+    1 where the controller is not stable on all of them, or more so on the others.
+
+    Args:
+        possible: the others.
+        study: of controller and machine.
+    """
+    own = Possible((), np.zeros((1, 0)))
+    nominal, least = margins_on(own, study)[0], margins_on(possible, study).min(initial=np.inf)
+    return max(float(nominal / least), 1.0) if least > 0 else 1.0
+
+
 def margins_on(possible: Possible, study: Study) -> np.ndarray:
     """Gain margin of a study's fixed controller on every machine [1], 0 where it has no loop, (n,).
 

@@ -30,9 +30,9 @@ from studies.tuning.spec import parse_tuning
 SECTION = "commission"
 #: Starting points and iterations of a tuning, machines it is tuned on and judged on.
 STARTS, ITERATIONS, TUNED_ON, JUDGED_ON = 16, 60, 3, 12
-#: Factor by which a tuning keeps more than the required gain margin: the true machine is none of
-#: those that it is tuned on.
-RESERVE = 1.1
+#: Factor by which a tuning keeps more than the required gain margin, beside what possible machines
+#: differ by.
+RESERVE = 1.02
 
 
 #: How much longer patches are on some plants of a certificate than in the model [1].
@@ -156,7 +156,10 @@ def certified_margin(measured: MeasuredSpec) -> float:
 
 
 def tuning_section(
-    measured: MeasuredSpec, study: Study, machines: dict[str, list[float]]
+    measured: MeasuredSpec,
+    study: Study,
+    machines: dict[str, list[float]],
+    spread: float = 1.0,
 ) -> dict[str, Any]:
     """Section [tune] for a fitted study.
 
@@ -164,6 +167,7 @@ def tuning_section(
         measured: what was asked for.
         study: the fitted one.
         machines: that the data leave possible, by field.
+        spread: gain margin of the fitted machine over the least one of possible machines [1].
     """
     written = measured.tune
     default = {
@@ -172,7 +176,7 @@ def tuning_section(
         "starts": STARTS,
         "iterations": ITERATIONS,
     }
-    margin = RESERVE * LONGER * certified_margin(measured)
+    margin = RESERVE * spread * LONGER * certified_margin(measured)
     limits = {"gain_margin": margin} | written.get("limits", {})
     scenarios = {"count": TUNED_ON, "check": JUDGED_ON} | written.get("scenarios", {})
     if machines:

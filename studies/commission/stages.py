@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from rich.console import Console
 
-from studies.commission.machines import Possible, unknown_to_controller
+from studies.commission.machines import Possible, margin_spread, unknown_to_controller
 from studies.commission.spec import MeasuredSpec, certified_margin, tuning_section
 from studies.engine.design import Design, load_design
 from studies.engine.fast_motion import TellingMotion, find_motion, with_own_motion
@@ -52,7 +52,8 @@ def _fit(measured: MeasuredSpec, out: Path, console: Console) -> None:
 def _tune(measured: MeasuredSpec, out: Path, console: Console) -> None:
     fitted, folder = fitted_study(out), out / "tune"
     study = fitted
-    columns = unknown_to_controller(possible_machines(out), study)
+    possible = possible_machines(out)
+    columns, spread = unknown_to_controller(possible, study), margin_spread(possible, study)
     indexed = [name for name in columns if name.startswith("link.stiffness_factor[")]
     if indexed:  # one number for all links so far
         whole = tuple(np.broadcast_to(study.link.stiffness_factor, 3).tolist())
@@ -60,7 +61,7 @@ def _tune(measured: MeasuredSpec, out: Path, console: Console) -> None:
     motion = TellingMotion(study, "") if measured.keeps_motion else find_motion(study)
     if motion.text:
         console.print(motion.text, soft_wrap=True)
-    section = tuning_section(measured, motion.study, columns)
+    section = tuning_section(measured, motion.study, columns, spread)
     spec = parse_tuning(motion.study.model_dump() | {"tune": section})
     run_tuning(spec, folder, (folder / PROGRESS).is_file(), console)
     chosen = with_own_motion(load_design(folder).study, fitted)

@@ -83,7 +83,7 @@ class OutputEntry(Common):
 class FileEntry(OutputEntry):
     """Fields of measurements in a file of columns."""
 
-    file: str = described(..., "-", "CSV, HDF5 or UFF, beside this file")
+    file: str = described(..., "-", "CSV, HDF5, MATLAB or UFF, beside this file")
 
 
 class NoiseEntry(Section):

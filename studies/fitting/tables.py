@@ -1,4 +1,4 @@
-"""Files of measurements: columns of numbers from CSV, HDF5 or UFF (type 58)."""
+"""Files of measurements: columns of numbers from CSV, HDF5, MATLAB or UFF (type 58)."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import scipy
 
 from studies.errors import StudyError, field_error, nearest, shown
+from studies.reading import LARGEST as LARGEST_FILE
 from studies.reading import open_hdf5, open_regular, read_bytes, read_text
 
 #: Endings of the formats.
-FORMATS = (".csv", ".txt", ".h5", ".hdf5", ".uff", ".unv")
+FORMATS = (".csv", ".txt", ".h5", ".hdf5", ".mat", ".uff", ".unv")
 #: Larger numbers are none that an instrument reads.
 LARGEST = 1e30
 #: Columns that a function of a UFF file becomes, by its abscissa: 18 frequency [Hz], else time [s].
@@ -23,7 +25,8 @@ def read_columns(file: str, folder: Path, path: str) -> dict[str, np.ndarray]:
     """Columns of a file by name, as text from CSV; `column` makes numbers of them.
 
     Args:
-        file: name, relative to `folder`; of HDF5 and UFF perhaps `file::group` or `file::number`.
+        file: name, relative to `folder`; of HDF5 and MATLAB perhaps `file::group`
+            (a struct), of UFF `file::number`.
         folder: where the file that names it is.
         path: where it is written, for messages.
 
@@ -39,6 +42,8 @@ def read_columns(file: str, folder: Path, path: str) -> dict[str, np.ndarray]:
             pass
         if where.suffix.lower() in (".h5", ".hdf5"):
             columns = _from_hdf5(where, inside)
+        elif where.suffix.lower() == ".mat":
+            columns = _from_matlab(where, inside)
         elif where.suffix.lower() in (".uff", ".unv"):
             columns = _from_uff(where, inside, path)
         else:
@@ -100,12 +105,14 @@ def _cell(text: str, where: str) -> float:
 
 def _from_csv(where: Path) -> dict[str, np.ndarray]:
     lines = read_text(where, encoding="utf-8-sig").splitlines(keepends=True)
-    rows = [row for row in csv.reader(lines) if row and not row[0].startswith("#")]
-    if len(rows) < 2:
+    lines = [line for line in lines if line.strip() and not line.startswith("#")]
+    if len(lines) < 2:
         raise ValueError("needs a row of names and one of numbers or more")
+    mark = next((x for x in (";", "\t") if x in lines[0]), ",")
+    rows = list(csv.reader(lines, delimiter=mark))
+    if mark == ";" and not any("." in line for line in lines[1:]):  # decimal commas
+        rows[1:] = [[x.replace(",", ".") for x in row] for row in rows[1:]]
     names = [name.strip() for name in rows[0]]
-    if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
-        raise ValueError("columns must be separated by commas")
     if len(set(names)) < len(names):
         raise ValueError("two columns have one name")
     width = len(names)
@@ -131,6 +138,46 @@ def _from_hdf5(where: Path, group: str) -> dict[str, np.ndarray]:
             for name, x in columns.items()
             if x.ndim == 1 and x.dtype.kind in "iufc"
         }
+
+
+def _from_matlab(where: Path, struct: str) -> dict[str, np.ndarray]:
+    """Vectors, not scalars, of a file that MATLAB saved; since version 7.3 it is one of HDF5."""
+    if h5py.is_hdf5(where):
+        return _from_matlab_hdf5(where, struct)
+    read_bytes(where)  # not larger than a file may be
+    try:
+        sizes = [np.prod(shape, dtype=float) for _, shape, _ in scipy.io.whosmat(where)]
+        if sum(sizes) * 16 > LARGEST_FILE:
+            raise ValueError(f"unpacks to more than {LARGEST_FILE / 2**20:g} MiB")
+        held = scipy.io.loadmat(where, squeeze_me=True, struct_as_record=True)
+    except Exception as error:  # of any kind, for a damaged file
+        raise ValueError(str(error) or "damaged") from error
+    if struct:
+        record = held.get(struct)
+        if not isinstance(record, np.ndarray) or record.dtype.names is None or record.size != 1:
+            raise ValueError(f"has no struct {struct}")
+        held = {name: np.squeeze(record[()][name]) for name in record.dtype.names}
+    return {
+        name: _numbers(x)
+        for name, x in held.items()
+        if isinstance(x, np.ndarray) and x.ndim == 1 and x.dtype.kind in "iufc"
+    }
+
+
+def _from_matlab_hdf5(where: Path, group: str) -> dict[str, np.ndarray]:
+    with open_hdf5(where) as file:
+        at = file[group] if group else file
+        if not isinstance(at, h5py.Group):
+            raise ValueError(f"{group} is not a struct")
+        columns = {}
+        for name, x in at.items():
+            if isinstance(x, h5py.Dataset) and max(x.shape, default=0) == x.size > 1:
+                values = np.ravel(x)
+                if values.dtype.names == ("real", "imag"):
+                    values = values["real"] + 1j * values["imag"]
+                if values.dtype.kind in "iufc":
+                    columns[name] = _numbers(values)
+        return columns
 
 
 def _from_uff(where: Path, number: str, path: str) -> dict[str, np.ndarray]:
