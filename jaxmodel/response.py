@@ -1,18 +1,21 @@
 """The machine as a test bench sees it: linear about a pose, from inputs to measured outputs.
 
 Inputs are voltages on the actuators, forces on the sliders, and a hammer on a link; outputs are
-voltages of the sensors, chord deflections, slider positions and the pose. The controller is off,
-the drive holds the pose.
+voltages of the sensors, chord deflections, motions of points of the links, slider positions and the
+pose. The controller is off, the drive holds the pose.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 from jaxmodel.bases import station_places
 from jaxmodel.beam import build_basis, held_frequency
 from jaxmodel.case import Case, Structure
 from jaxmodel.drive import Reference
+from jaxmodel.drives import DRIVES
+from jaxmodel.drives.contract import drive_gains
 from jaxmodel.kinematics import close_chain
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.linear import flatten, linearise, resting
@@ -31,11 +34,14 @@ class BenchPlant(NamedTuple):
     hammer: Array  # B of forces across the links at the stations, (n, 3 S)
     sensor: Array  # voltages of the sensors [V], (3 K, n)
     deflection: Array  # chord deflection at the stations [m], (3 S, n)
+    across: Array  # of a point at a station in the plane, across its link [m], (3 S, n)
+    along: Array  # the same along its link [m], (3 S, n)
     slider: Array  # slider positions [m], (3, n)
     pose: Array  # [m, m, rad], (3, n)
     # D, of the modes that are left out; zero for all other pairs
     actuator_to_sensor: Array  # [V/V], (3 K, 3 K)
     actuator_to_deflection: Array  # [m/V], (3 S, 3 K)
+    drive: Array  # proportional and derivative gain of the sliders' drive [N/m, N s/m], (2, 3)
 
 
 def bench_plant(structure: Structure, case: Case, pose: Array) -> BenchPlant:
@@ -58,6 +64,9 @@ def bench_plant(structure: Structure, case: Case, pose: Array) -> BenchPlant:
         return close_chain(loop.plant, at, still).rho
 
     r3 = 3 * structure.n_modes
+    to_pose = jnp.pad(jnp.eye(3), ((0, 0), (0, 3 + 2 * r3)))
+    across, along = jax.jacfwd(partial(_point_rates, loop, station_places(case), pose))(still)
+    gains = drive_gains(DRIVES[structure.drive], loop.drive)
     return BenchPlant(
         state=plant.state,
         actuator=plant.voltage,
@@ -65,11 +74,21 @@ def bench_plant(structure: Structure, case: Case, pose: Array) -> BenchPlant:
         hammer=_hammer(structure, loop, case, pose),
         sensor=plant.sensor,
         deflection=plant.deflection,
+        across=jnp.reshape(across, (-1, 3)) @ to_pose + plant.deflection,
+        along=jnp.reshape(along, (-1, 3)) @ to_pose,
         slider=jnp.pad(jax.jacfwd(rho)(pose), ((0, 0), (0, 3 + 2 * r3))),
-        pose=jnp.pad(jnp.eye(3), ((0, 0), (0, 3 + 2 * r3))),
+        pose=to_pose,
         actuator_to_sensor=plant.direct_sensor,
         actuator_to_deflection=plant.direct_deflection,
+        drive=jnp.stack([gains.position, gains.rate]),
     )
+
+
+def _point_rates(loop: Loop, stations: Array, pose: Array, rate: Array) -> tuple[Array, Array]:
+    """Velocities of the stations of straight links, across and along them [m/s], (3, S) each."""
+    chain = close_chain(loop.plant, pose, rate)
+    across = stations * chain.gamma_rate[:, None] - (chain.sine * chain.rho_rate)[:, None]
+    return across, jnp.broadcast_to((chain.cosine * chain.rho_rate)[:, None], across.shape)
 
 
 def _hammer(structure: Structure, loop: Loop, case: Case, pose: Array) -> Array:
@@ -81,11 +100,7 @@ def _hammer(structure: Structure, loop: Loop, case: Case, pose: Array) -> Array:
     stations, count = station_places(case), loop.deflection_at.shape[1]
     still, zero = jnp.zeros_like(pose), jnp.zeros_like(loop.omega)
 
-    def across(rate: Array) -> Array:
-        chain = close_chain(loop.plant, pose, rate)
-        return stations * chain.gamma_rate[:, None] - (chain.sine * chain.rho_rate)[:, None]
-
-    to_pose = jax.jacfwd(across)(still)  # (3, S, 3)
+    to_pose, _ = jax.jacfwd(partial(_point_rates, loop, stations, pose))(still)  # (3, S, 3)
     # forces on modes enter where the actuators' do
     on_modes = jnp.swapaxes(loop.deflection_at, 1, 2) / loop.plant.modal_mass[:, None, None]
     pushed = loop._replace(actuator=on_modes)

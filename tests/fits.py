@@ -74,6 +74,8 @@ HAMMER = RESPONSE | {
     "quantity": "acceleration",
     "sigma": 0.02,
 }
+ACCELEROMETER = RESPONSE | {"input": "slider 1", "output": "accelerometer 2 at 0.06 to 40"}
+MOTOR = RESPONSE | {"input": "command 1", "output": "motor 1"}
 MAGNITUDE = HAMMER | {"magnitude": "real"}
 FREQUENCY = np.linspace(60.0, 500.0, 200)
 TIME = np.linspace(0.01, 0.059, 180)

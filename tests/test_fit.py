@@ -34,11 +34,13 @@ from studies.publish import check_folder
 from studies.study.spec import load_study
 from studies.tuning.spec import load_tuning
 from tests.fits import (
+    ACCELEROMETER,
     FIGURES,
     FREQUENCY,
     HAMMER,
     MAGNITUDE,
     MODES,
+    MOTOR,
     REDUCTION,
     RESPONSE,
     SETTLING,
@@ -87,6 +89,8 @@ ENTRIES = {
     "modes": MODES,
     "response": RESPONSE,
     "magnitude": MAGNITUDE,
+    "accelerometer": ACCELEROMETER,
+    "motor": MOTOR,
     "spectrum": SPECTRUM,
     "trace": TRACE,
     "settling": SETTLING,

@@ -94,23 +94,38 @@ class PlantAt:
         return Modes(pole[upper], right[:, upper], left[upper])
 
     def output(self, signal: Signal, rows: int) -> Row:
-        """Row of C, (n,), and its derivatives, (n, p)."""
-        return self._at("pose" if signal.kind == "platform" else signal.kind, rows)
+        """Row of C, (n,), and its derivatives, (n, p); of a motor that of its slider's position."""
+        if signal.kind == "accelerometer":
+            turn = np.deg2rad(signal.angle)
+            return _sum_of(
+                (np.cos(turn), self._at("along", rows)), (np.sin(turn), self._at("across", rows))
+            )
+        return self._at({"platform": "pose", "motor": "slider"}.get(signal.kind, signal.kind), rows)
 
     def input(self, signal: Signal, column: int) -> Row:
-        """Column of B, (n,), and its derivatives, (n, p)."""
-        name = {"actuator": "actuator", "hammer": "hammer", "slider": "slider_force"}[signal.kind]
+        """Column of B, (n,), and its derivatives, (n, p); a command is a force on its slider."""
+        name = signal.kind if signal.kind in ("actuator", "hammer") else "slider_force"
         return self._at(name, (slice(None), column))
 
     def direct(self, source: Signal, output: Signal, column: int, row: int) -> Row:
         """Entry of D, (), and its derivatives, (p,)."""
         if source.kind == "actuator" and output.kind in ("sensor", "deflection"):
             return self._at(f"actuator_to_{output.kind}", (row, column))
+        if source.kind == "actuator" and output.kind == "accelerometer":
+            across = np.sin(np.deg2rad(output.angle))
+            return _sum_of((across, self._at("actuator_to_deflection", (row, column))))
         return np.zeros(()), None if self.slope is None else np.zeros(())
 
     def _at(self, name: str, index: Any) -> Row:
         value = getattr(self.value, name)[index]
         return value, None if self.slope is None else getattr(self.slope, name)[index]
+
+
+def _sum_of(*parts: tuple[float, Row]) -> Row:
+    """Sum of rows, each times a number."""
+    value = sum(factor * row[0] for factor, row in parts)
+    slopes = [factor * row[1] for factor, row in parts if row[1] is not None]
+    return np.asarray(value), np.sum(slopes, axis=0) if slopes else None
 
 
 def with_outputs_at(study: Study, place: Place, places: tuple[float, ...]) -> tuple[Study, Place]:
@@ -313,6 +328,48 @@ class FrequencyResponse(NamedTuple):
 
 
 def response(
+    plant: PlantAt, signals: tuple[Signal, Signal], at: tuple[int, int], omega: np.ndarray
+) -> FrequencyResponse:
+    """Frequency response of one input and one output.
+
+    A command r acts on its slider by the drive, F = (Kp + j omega Kd) (r - rho), and this is what
+    the motor's output is.
+
+    Args:
+        plant: at the pose.
+        signals: input and output.
+        at: their places among signals of their kinds.
+        omega: [rad/s], (f,).
+    """
+    found = _of_plant(plant, signals, at, omega)
+    source, output = signals
+    if output.kind == "motor":
+        found = _times(found, _drive(plant, output.link, omega), -1.0)
+    if source.kind == "command":
+        found = _times(found, _drive(plant, source.link, omega), 1.0)
+        if output.kind == "motor" and output.link == source.link:
+            own = _drive(plant, source.link, omega)
+            slope = None if found.slope is None or own.slope is None else found.slope + own.slope
+            found = FrequencyResponse(found.value + own.value, slope)
+    return found
+
+
+def _drive(plant: PlantAt, link: int, omega: np.ndarray) -> FrequencyResponse:
+    """Kp + j omega Kd of a slider's drive."""
+    turn = np.stack([np.ones_like(omega), 1j * omega], axis=1)  # (f, 2)
+    slope = None if plant.slope is None else turn @ plant.slope.drive[:, link]
+    return FrequencyResponse(turn @ plant.value.drive[:, link], slope)
+
+
+def _times(one: FrequencyResponse, other: FrequencyResponse, sign: float) -> FrequencyResponse:
+    """The product of two, times a sign."""
+    slope = None
+    if one.slope is not None and other.slope is not None:
+        slope = sign * (one.slope * other.value[:, None] + other.slope * one.value[:, None])
+    return FrequencyResponse(sign * one.value * other.value, slope)
+
+
+def _of_plant(
     plant: PlantAt, signals: tuple[Signal, Signal], at: tuple[int, int], omega: np.ndarray
 ) -> FrequencyResponse:
     """C (j omega - A)^-1 B + D of one input and one output.

@@ -14,9 +14,10 @@ from studies.fitting.bench import Pose as At
 from studies.fitting.kinds.contract import Measurement, Noise
 from studies.fitting.kinds.figures import Compared, Figures, Runs, Switch
 from studies.fitting.kinds.modes import HeldModes, MachineModes, Measured, check_ascending
-from studies.fitting.kinds.motions import OFF, Motions
+from studies.fitting.kinds.motions import OFF, RECORDED, Motions
 from studies.fitting.kinds.response import ComplexResponse, Magnitude, Spectrum
 from studies.fitting.kinds.traces import Band, Settling, Trace
+from studies.fitting.records import RecordSettings, recorded_response
 from studies.fitting.spec import (
     Common,
     FiguresEntry,
@@ -26,8 +27,10 @@ from studies.fitting.spec import (
     NoiseEntry,
     OutputEntry,
     PoseEntry,
+    RecordEntry,
     ResponseEntry,
     SettlingEntry,
+    ShakenEntry,
     SpectrumEntry,
     TraceEntry,
 )
@@ -41,6 +44,8 @@ from studies.study.signals import INPUTS, OUTPUTS, Signal, parse_signal
 SMALLEST = 1e-100
 #: Derivatives of the output by its quantity.
 ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
+#: The same of outputs that have one quantity.
+GIVEN = {"accelerometer": 2, "motor": 0}
 
 
 class Models(NamedTuple):
@@ -58,7 +63,7 @@ def make_bench(spec: FitSpec) -> Bench:
         is_held = isinstance(entry, ModesEntry) and entry.ends == "held"
         if isinstance(entry, PoseEntry) and not is_held:
             poses.setdefault(_pose(spec, entry), f"fit.data[{k}].pose")
-    places = _places(spec, (ResponseEntry, SpectrumEntry))
+    places = _places(spec, (ShakenEntry,))
     bench = Bench(spec.study, spec.free.place, tuple(poses), places, spec.free.fields)
     for pose, path in poses.items():
         bench.check(pose, path)
@@ -89,10 +94,17 @@ def _signals(spec: FitSpec, entry: Common, path: str) -> tuple[Signal, ...]:
     if not isinstance(entry, OutputEntry):
         return ()
     sizes = build_structure(spec.study).n_patches, each_link(spec.study.link.length)
-    output = parse_signal(entry.output, OUTPUTS, *sizes, f"{path}.output")
-    if not isinstance(entry, (ResponseEntry, SpectrumEntry)):
+    kinds = OUTPUTS if isinstance(entry, ShakenEntry) else {x: OUTPUTS[x] for x in RECORDED}
+    output = parse_signal(entry.output, kinds, *sizes, f"{path}.output")
+    if not isinstance(entry, ShakenEntry):
         return (output,)
-    return parse_signal(entry.input, INPUTS, *sizes, f"{path}.input"), output
+    source = parse_signal(entry.input, INPUTS, *sizes, f"{path}.input")
+    if (source.kind == "command" or output.kind == "motor") and spec.study.drive.kind != "pd":
+        raise StudyError(
+            f"{path}: responses from commands and to motors are known of drive.kind = 'pd' only, "
+            f"which has no forward path; it is {spec.study.drive.kind!r}"
+        )
+    return source, output
 
 
 def _places(spec: FitSpec, kinds: tuple[type[OutputEntry], ...]) -> tuple[float, ...]:
@@ -208,10 +220,35 @@ def _response(spec: FitSpec, models: Models, entry: ResponseEntry, path: str) ->
         models.bench,
         _pose(spec, entry),
         (signals[0], signals[1]),
-        ORDERS[entry.quantity],
+        _order(entry, signals, path),
         frequency,
         measured,
         _noise(entry, measured, path),
+        _unit(signals, ORDERS[entry.quantity]),
+    )
+
+
+def _record(spec: FitSpec, models: Models, entry: RecordEntry, path: str) -> Measurement:
+    read, signals = _read(spec, entry, path), _signals(spec, entry, path)
+    names = entry.time, entry.source, entry.value
+    time, source, output = (_real(read(x), x, path) for x in names)
+    settings = RecordSettings(
+        segment=entry.segment_s,
+        has_window=entry.window == "hann",
+        is_h2=entry.estimator == "H2",
+        band=(entry.from_hz, entry.to_hz),
+    )
+    found = recorded_response(time, source, output, settings, path)
+    return ComplexResponse(
+        entry.name,
+        entry.check,
+        models.bench,
+        _pose(spec, entry),
+        (signals[0], signals[1]),
+        _order(entry, signals, path),
+        found.frequency,
+        found.value,
+        Noise(found.sigma, entry.sigma_percent / 100),
         _unit(signals, ORDERS[entry.quantity]),
     )
 
@@ -236,6 +273,15 @@ def _check_frequency(
         )
 
 
+def _order(entry: ShakenEntry, signals: tuple[Signal, ...], path: str) -> int:
+    """Derivatives by time that the output has."""
+    if signals[1].kind not in GIVEN:
+        return ORDERS[entry.quantity]
+    if "quantity" in entry.model_fields_set:
+        raise StudyError(f"{path}.quantity: has no meaning for {entry.output!r}; leave it out")
+    return GIVEN[signals[1].kind]
+
+
 def _unit(signals: tuple[Signal, ...], order: int) -> str:
     per = ("", "/s", "/s^2")[order]
     return f"{OUTPUTS[signals[1].kind][1]}{per}/{INPUTS[signals[0].kind][1]}"
@@ -258,7 +304,7 @@ def _spectrum(spec: FitSpec, models: Models, entry: SpectrumEntry, path: str) ->
         models.bench,
         _pose(spec, entry),
         (signals[0], signals[1]),
-        ORDERS[entry.quantity],
+        _order(entry, signals, path),
         frequency,
         density,
         Noise(0.0, 0.0),
@@ -291,7 +337,7 @@ def _settling(spec: FitSpec, models: Models, entry: SettlingEntry, path: str) ->
     if (entry.band is None) == (entry.band_percent is None):
         raise StudyError(f"{path}: give band [unit of the output] or band_percent [%], one of them")
     (signal,) = _signals(spec, entry, path)
-    if signal.kind in ("slider", "platform"):
+    if signal.kind in ("slider", "platform", "motor"):
         forms = ", ".join(OUTPUTS[x][0] for x in ("sensor", "deflection"))
         raise field_error(f"{path}.output", entry.output, f"{forms}, which settle about 0")
     if entry.time_s > spec.study.run.duration:
@@ -348,6 +394,7 @@ def _figures(spec: FitSpec, models: Models, entry: FiguresEntry, path: str) -> M
 _MAKERS: dict[type[Common], Callable[..., Measurement]] = {
     ModesEntry: _modes,
     ResponseEntry: _response,
+    RecordEntry: _record,
     SpectrumEntry: _spectrum,
     TraceEntry: _trace,
     SettlingEntry: _settling,

@@ -93,26 +93,49 @@ class NoiseEntry(Section):
     sigma_percent: Percent | None = described(None, "%", "standard deviation over the value")
 
 
-class ResponseEntry(FileEntry, PoseEntry, NoiseEntry):
-    """A frequency response."""
+class ShakenEntry(FileEntry, PoseEntry):
+    """Fields of measurements of a machine that is shaken."""
 
     input: str = described(..., "-", "what shakes the machine")
     quantity: Literal["displacement", "velocity", "acceleration"] = described(
-        "displacement", "-", "of the output: as named, or its derivative"
+        "displacement", "-", "of the output: as named, or its derivative; an accelerometer has none"
     )
+
+
+class ResponseEntry(ShakenEntry, NoiseEntry):
+    """A frequency response."""
+
     frequency: str = described("frequency_hz", "-", "column")
     real: str = described("real", "-", "column")
     imag: str = described("imag", "-", "column")
     magnitude: str = described("", "-", "column; instead of real and imaginary part")
 
 
-class SpectrumEntry(FileEntry, PoseEntry):
+class RecordEntry(ShakenEntry):
+    """Raw time records of an input and an output, which become a frequency response."""
+
+    time: str = described("time", "-", "column [s], evenly spaced")
+    source: str = described("input", "-", "column of the input")
+    value: str = described("output", "-", "column of the output")
+    segment_s: Positive = described(..., "s", "length of the segments that are averaged")
+    window: Literal["hann", "none"] = described(
+        "hann", "-", "of segments that overlap by half; none: each is an impact that has decayed"
+    )
+    estimator: Literal["H1", "H2"] = described(
+        "H1", "-", "H1: noise on the output; H2: noise on the input"
+    )
+    from_hz: float = described(0.0, "Hz", "lowest frequency that is kept", ge=0, le=1e5)
+    to_hz: float = described(
+        0.0, "Hz", "highest one; 0: 0.4 times the sample rate of the record", ge=0, le=1e5
+    )
+    sigma_percent: Percent = described(
+        0.2, "%", "standard deviation over the value, beside what the coherence says"
+    )
+
+
+class SpectrumEntry(ShakenEntry):
     """A power spectrum under a white input of unknown strength."""
 
-    input: str = described(..., "-", "where the white force or voltage acts")
-    quantity: Literal["displacement", "velocity", "acceleration"] = described(
-        "displacement", "-", "of the output: as named, or its derivative"
-    )
     frequency: str = described("frequency_hz", "-", "column")
     density: str = described("density", "-", "column, unit^2/Hz in any scale")
     averages: int = described(1, "1", "independent spectra in the mean", ge=1, le=10**6)
@@ -166,6 +189,7 @@ class FiguresEntry(Common, NoiseEntry):
 ENTRIES: dict[str, type[Common]] = {
     "modes": ModesEntry,
     "response": ResponseEntry,
+    "record": RecordEntry,
     "spectrum": SpectrumEntry,
     "trace": TraceEntry,
     "settling": SettlingEntry,

@@ -14,14 +14,21 @@ INPUTS = {
     "actuator": ("actuator LINK.PATCH", "V"),
     "slider": ("slider LINK", "N"),
     "hammer": ("hammer LINK at X", "N"),
+    "command": ("command LINK", "m"),
 }
 OUTPUTS = {
     "sensor": ("sensor LINK.PATCH", "V"),
     "deflection": ("deflection LINK at X", "m"),
+    "accelerometer": ("accelerometer LINK at X to ANGLE", "m/s^2"),
     "slider": ("slider LINK", "m"),
+    "motor": ("motor LINK", "N"),
     "platform": ("platform x, y or phi", "m"),
 }
-_NUMBERED = re.compile(r"(\w+) ([1-9])(?:\.([1-9]))?(?: at ([0-9.eE+-]+))?")
+#: Those with a place along a link.
+_PLACED = ("hammer", "deflection", "accelerometer")
+#: Direction of an accelerometer from its link's axis if none is given: across it [deg].
+ACROSS = 90.0
+_NUMBERED = re.compile(r"(\w+) ([1-9])(?:\.([1-9]))?(?: at ([0-9.eE+-]+))?(?: to ([0-9.eE+-]+))?")
 _PLATFORM = {"platform x": 0, "platform y": 1, "platform phi": 2}
 
 
@@ -32,12 +39,13 @@ class Signal(NamedTuple):
     link: int  # from 0; of the platform: its coordinate
     patch: int  # from 0
     place: float  # from the slider's joint along the link [m], nan if it has none
+    angle: float = ACROSS  # of an accelerometer, from the link's axis to its normal [deg]
 
     def row(self, n_patches: int, stations: tuple[float, ...]) -> int:
         """Its place among all signals of its kind."""
         if self.kind in ("actuator", "sensor"):
             return self.link * n_patches + self.patch
-        if self.kind in ("hammer", "deflection"):
+        if self.kind in _PLACED:
             return self.link * len(stations) + stations.index(self.place)
         return self.link
 
@@ -71,18 +79,22 @@ def parse_signal(
     patch = int(match[3] or 1)
     if patch > n_patches:
         raise field_error(path, text, f"patches 1 to {n_patches}")
-    if (kind in ("hammer", "deflection")) != (match[4] is not None):
+    if (kind in _PLACED) != (match[4] is not None):
         raise field_error(path, text, kinds[kind][0])
-    place = np.nan
+    if match[5] is not None and kind != "accelerometer":
+        raise field_error(path, text, kinds[kind][0])
+    place, angle = np.nan, ACROSS
+    try:
+        place, angle = float(match[4] or np.nan), float(match[5] or ACROSS)
+    except ValueError:
+        raise field_error(path, text, kinds[kind][0], "m; deg") from None
+    if not -360 <= angle <= 360:
+        raise field_error(path, text, "angles of -360 to 360", "deg")
     if match[4] is not None:
-        try:
-            place = float(match[4])
-        except ValueError:
-            raise field_error(path, text, kinds[kind][0], "m") from None
         shortest = float(np.min(length))  # places are common to all links
         if not 0 < place < shortest:
             raise field_error(path, text, f"between 0 and {shortest:g}", "m")
-    return Signal(kind, link - 1, patch - 1, place)
+    return Signal(kind, link - 1, patch - 1, place, angle)
 
 
 def signal_name(signal: Signal) -> str:
@@ -90,4 +102,7 @@ def signal_name(signal: Signal) -> str:
     name = f"{signal.kind} {signal.link + 1}"
     if signal.kind in ("actuator", "sensor"):
         return f"{name}.{signal.patch + 1}"
-    return name if np.isnan(signal.place) else f"{name} at {signal.place:g}"
+    if np.isnan(signal.place):
+        return name
+    turned = "" if signal.angle == ACROSS else f" to {signal.angle:g}"
+    return f"{name} at {signal.place:g}{turned}"

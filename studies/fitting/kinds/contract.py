@@ -66,12 +66,12 @@ class DataAndModel(NamedTuple):
 class Noise(NamedTuple):
     """Standard deviation of measured values: both parts in quadrature."""
 
-    fixed: float  # in the unit of the values
+    fixed: float | np.ndarray  # in the unit of the values, of all or of each
     share: float  # of the values [1]
 
     def sigma(self, value: np.ndarray) -> np.ndarray:
         """Of each value."""
-        return np.hypot(self.fixed, self.share * np.abs(value))
+        return np.asarray(np.hypot(self.fixed, self.share * np.abs(value)))
 
     def of_model(self, model: np.ndarray, measured: np.ndarray) -> np.ndarray:
         """The same of a model's values; of measured ones where the model is 0."""

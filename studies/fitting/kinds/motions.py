@@ -29,6 +29,7 @@ OFF = (False, False, False)
 RECORDED = {
     "sensor": "sensor_voltage",
     "slider": "slider",
+    "motor": "slider_force",
     "platform": "pose",
     "deflection": "chord_deflection_stations",
 }

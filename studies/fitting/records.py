@@ -1,0 +1,150 @@
+"""Raw time records of an input and an output as a frequency response with its noise.
+
+Segments of the record are averaged (Welch). Of a coherence g^2 over n independent segments, real
+and imaginary part of the estimate each have the standard deviation |H| sqrt((1 - g^2)/(2 n g^2))
+(Bendat and Piersol, Random Data, 2010, chapter 9). A window blurs what is narrower than the
+reciprocal of a segment, by an error that falls with the square of its length: a third of what
+segments of half the length differ by. That is taken off (Richardson), and a part of it is left as
+uncertainty.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import signal
+
+from studies.errors import StudyError, field_error
+
+#: Independent segments in n that overlap by half under a Hann window, over n [1].
+INDEPENDENT = 0.95
+#: Share of a window's error that is left once it was taken off, and how much noisier that makes a
+#: response [1].
+LEFT, NOISIER = 0.15, 1.15
+#: Steps of the time may differ by this share.
+UNEVEN = 1e-3
+#: Segments at least; one has no coherence.
+FEWEST = 4
+#: Share of the sample rate up to which responses are taken if nothing else is said [1].
+HIGHEST = 0.4
+
+
+class RecordSettings(NamedTuple):
+    """How a record becomes a response."""
+
+    segment: float  # length of a segment [s]
+    has_window: bool  # Hann, segments overlap by half; else each one stands alone, as impacts do
+    is_h2: bool  # noise is on the input rather than on the output
+    band: tuple[float, float]  # frequencies that are kept [Hz]; an end of 0: as far as it goes
+
+
+class RecordedResponse(NamedTuple):
+    """A frequency response from records."""
+
+    frequency: np.ndarray  # [Hz], (f,)
+    value: np.ndarray  # complex, (f,)
+    sigma: np.ndarray  # of real and imaginary part, (f,)
+    coherence: np.ndarray  # [1], (f,)
+    averages: float  # independent segments
+
+
+def recorded_response(
+    time: np.ndarray, source: np.ndarray, output: np.ndarray, settings: RecordSettings, path: str
+) -> RecordedResponse:
+    """The response of a recorded output to a recorded input.
+
+    Args:
+        time: [s], evenly spaced, (n,).
+        source, output: (n,).
+        settings: how.
+        path: where it is written, for messages.
+
+    Raises:
+        StudyError: uneven time, records that are too short, or an input that does nothing.
+    """
+    step = _step(time, path)
+    size = 2 * max(round(settings.segment / (2 * step)), 1)
+    last = float(time[-1] - time[0])
+    hop = size // 2 if settings.has_window else size
+    count = (len(time) - size) // hop + 1 if len(time) >= size else 0
+    if size < 16 or count < FEWEST:
+        raise field_error(
+            f"{path}.segment_s",
+            settings.segment,
+            f"{16 * step:.3g} to {_longest(last, settings):.3g}: {FEWEST} segments or more of this "
+            f"record of {last:.4g} s",
+            "s",
+        )
+    if not np.ptp(source) > 0:
+        raise StudyError(f"{path}: the recorded input does not change")
+    whole = _estimate(source, output, step, size, settings)
+    half = _estimate(source, output, step, size // 2, settings)
+    averages = INDEPENDENT * count if settings.has_window else float(count)
+    low, high = settings.band
+    # neighbours are alike under a window, and segments of half the length know every other one
+    frequency = whole.frequency[2::2]
+    keep = (frequency >= low) & (frequency <= (high or HIGHEST / step))
+    if np.sum(keep) < 3:
+        raise StudyError(
+            f"{path}: {int(np.sum(keep))} frequencies between from_hz = {low:g} and to_hz = "
+            f"{high or HIGHEST / step:g}; allowed: 3 or more, {2 / (size * step):.3g} Hz apart"
+        )
+    value, coherence = whole.value[2::2][keep], whole.coherence[2::2][keep]
+    share = np.clip(coherence, 1e-6, 1.0)
+    random = np.abs(value) * np.sqrt((1 - share) / (2 * averages * share))
+    if not settings.has_window:  # segments are not cut out of what goes on
+        return RecordedResponse(frequency[keep], value, random, coherence, averages)
+    blurred = (value - half.value[1 : len(frequency) + 1][keep]) / 3
+    return RecordedResponse(
+        frequency=frequency[keep],
+        value=value + blurred,
+        sigma=np.hypot(NOISIER * random, LEFT * np.abs(blurred)),
+        coherence=coherence,
+        averages=averages,
+    )
+
+
+def _longest(duration: float, settings: RecordSettings) -> float:
+    """Longest segment of which there are `FEWEST` [s]."""
+    return duration * (2 / (FEWEST + 1) if settings.has_window else 1 / FEWEST)
+
+
+def _step(time: np.ndarray, path: str) -> float:
+    """Sample period [s]."""
+    steps = np.diff(time)
+    step = float(np.mean(steps)) if len(steps) else 0.0
+    if not step > 0 or np.abs(steps - step).max() > UNEVEN * step:
+        row = int(np.argmax(np.abs(steps - step))) + 2 if len(steps) else 1
+        raise StudyError(
+            f"{path}: time must ascend evenly, as records do; row {row} does not (or give a "
+            "response with kind = 'response')"
+        )
+    return step
+
+
+class _Estimate(NamedTuple):
+    frequency: np.ndarray
+    value: np.ndarray
+    coherence: np.ndarray
+
+
+def _estimate(
+    source: np.ndarray, output: np.ndarray, step: float, size: int, settings: RecordSettings
+) -> _Estimate:
+    """Averages over segments of so many samples."""
+    how = {
+        "fs": 1 / step,
+        "window": "hann" if settings.has_window else "boxcar",
+        "nperseg": size,
+        "noverlap": size // 2 if settings.has_window else 0,
+        "detrend": "constant" if settings.has_window else False,
+    }
+    frequency, cross = signal.csd(source, output, **how)
+    _, power = signal.welch(source, **how)
+    _, answer = signal.welch(output, **how)
+    power, answer = (np.maximum(x, np.finfo(float).tiny) for x in (power, answer))
+    coherence = np.minimum(np.abs(cross) ** 2 / (power * answer), 1.0)
+    safe = np.where(np.abs(cross) > 0, cross, np.finfo(float).tiny)
+    value = answer / safe.conj() if settings.is_h2 else cross / power
+    return _Estimate(frequency, value, coherence)

@@ -1,0 +1,126 @@
+"""Raw time records of a shaken machine, as frequency responses with their noise."""
+
+import numpy as np
+import pytest
+
+from studies.errors import StudyError
+from studies.fitting.estimate import fit
+from studies.fitting.records import RecordSettings, recorded_response
+from tests.fits import ASKEW, made, spec_of, write
+
+RATE, LENGTH = 2000.0, 2**17
+HANN = RecordSettings(segment=4.0, has_window=True, is_h2=False, band=(60.0, 500.0))
+RECORD = {
+    "kind": "record",
+    "pose": ASKEW,
+    "input": "actuator 1.1",
+    "output": "sensor 1.1",
+    "file": "record.csv",
+    "segment_s": 4.0,
+    "from_hz": 60.0,
+    "to_hz": 500.0,
+}
+
+
+def two_modes(frequency):
+    """Responses of a machine with two lightly damped modes [1]."""
+    s = 2j * np.pi * np.asarray(frequency)
+    return sum(
+        a * w**2 / (s**2 + 2 * z * w * s + w**2)
+        for a, w, z in ((1.0, 2 * np.pi * 114.0, 0.01), (-0.3, 2 * np.pi * 457.0, 0.005))
+    )
+
+
+def recorded(law, seed, noise=0.02, on_input=0.0, length=LENGTH):
+    """Time, white input and the response to it, with noise of a share of its rms."""
+    rng = np.random.default_rng(seed)
+    source = rng.normal(size=length)
+    spectrum = np.fft.rfft(source) * law(np.fft.rfftfreq(length, 1 / RATE))
+    output = np.fft.irfft(spectrum, length)
+    output = output + noise * output.std() * rng.normal(size=length)
+    source = source + on_input * rng.normal(size=length)
+    return np.arange(length) / RATE, source, output
+
+
+def test_the_response_is_within_its_noise():
+    """Standard deviations are right to a tenth, at the modes to a fifth, over 10 records."""
+    away, at_modes = [], []
+    for seed in range(10):
+        found = recorded_response(*recorded(two_modes, seed), HANN, "data")
+        off = ((found.value - two_modes(found.frequency)) / found.sigma).real
+        is_near = np.abs(found.frequency - 114.0) < 3
+        away, at_modes = [*away, *off], [*at_modes, *off[is_near]]
+    assert np.std(away) == pytest.approx(1, abs=0.1) and abs(np.mean(away)) < 0.05
+    assert np.std(at_modes) == pytest.approx(1, abs=0.2) and abs(np.mean(at_modes)) < 0.3
+    assert found.averages == pytest.approx(0.95 * 31, abs=2) and found.coherence.max() <= 1
+
+
+def test_neighbours_are_independent():
+    found = recorded_response(*recorded(two_modes, 0, noise=0.5), HANN, "data")
+    off = ((found.value - two_modes(found.frequency)) / found.sigma).real
+    assert abs(np.corrcoef(off[1:], off[:-1])[0, 1]) < 0.2
+
+
+def test_noise_on_the_input_is_left_to_h2():
+    """H1 is too small by the share of noise in the input's power, H2 is not."""
+    data = recorded(two_modes, 0, noise=0.0, on_input=0.5)
+    ratios = []
+    for is_h2 in (False, True):
+        found = recorded_response(*data, HANN._replace(is_h2=is_h2), "data")
+        ratios.append(np.median(np.abs(found.value / two_modes(found.frequency))))
+    assert ratios[0] == pytest.approx(1 / 1.25, rel=0.03)
+    assert ratios[1] == pytest.approx(1.0, rel=0.03)
+
+
+def test_impacts_stand_alone():
+    """Each segment has one that has decayed: no window, and nothing of it leaks."""
+    size, hits = int(2.0 * RATE), 8
+    rng, source = np.random.default_rng(0), np.zeros(hits * size)
+    for k in range(hits):
+        source[k * size + 10 : k * size + 14] = rng.uniform(0.5, 1.5) * np.array([1, 3, 2, 0.5])
+    output = np.fft.irfft(
+        np.fft.rfft(source) * two_modes(np.fft.rfftfreq(len(source), 1 / RATE)), len(source)
+    )
+    output = output + 1e-4 * np.abs(output).max() * rng.normal(size=len(source))
+    settings = HANN._replace(segment=2.0, has_window=False)
+    found = recorded_response(np.arange(len(source)) / RATE, source, output, settings, "data")
+    assert found.averages == hits
+    error = np.abs(found.value - two_modes(found.frequency))
+    assert np.median(error / np.abs(two_modes(found.frequency))) < 2e-3
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"segment_s": 40.0}, r"segment_s = 40.0; allowed: 0.008 to 26.2: 4 segments or more"),
+        ({"segment_s": 1e-4}, "segment_s = 0.0001; allowed"),
+        ({"to_hz": 60.1}, "allowed: 3 or more, 0.5 Hz apart"),
+        ({"source": "force"}, "no column 'force'"),
+        ({"source": "still"}, "the recorded input does not change"),
+        ({"time": "value"}, "time must ascend evenly"),
+        ({"window": "flat"}, "window = 'flat'"),
+    ],
+)
+def test_what_is_no_record_is_refused(change, message, tmp_path):
+    time, source, output = recorded(two_modes, 0)
+    columns = {"input": source, "output": output, "still": 0 * time, "value": time**2}
+    write(tmp_path, "record.csv", time=time, **columns)
+    with pytest.raises(StudyError, match=message):
+        made(spec_of(tmp_path, RECORD | change))
+
+
+def test_a_machine_is_fitted_to_its_record(tmp_path):
+    """A record of 65 s made with the model's response gives the numbers back."""
+    response = {k: x for k, x in RECORD.items() if k not in ("segment_s", "from_hz", "to_hz")}
+    grid = np.fft.rfftfreq(LENGTH, 1 / RATE)[1:-1]
+    one = np.ones(len(grid))
+    write(tmp_path, "grid.csv", frequency_hz=grid, real=one, imag=one)
+    exact = {"kind": "response", "file": "grid.csv", "sigma": 1.0}
+    _, (model,), truth = made(spec_of(tmp_path, response | exact))
+    curve, _ = model.predict(truth, False)
+    time, source, output = recorded(lambda f: np.r_[0, curve, 0], 3)
+    write(tmp_path, "record.csv", time=time, input=source, output=output)
+    found = fit(spec_of(tmp_path, RECORD))
+    assert found.answer.is_explained
+    away = np.abs(found.answer.values - truth) / found.answer.sigma
+    assert np.all(away < 4) and np.all(found.answer.sigma[:2] < 0.01 * truth[:2])
