@@ -14,6 +14,7 @@ from studies.export.run import DAC_BITS
 from studies.fitting.measurements import make_bench, make_measurements
 from studies.fitting.spec import parse_fit
 from studies.study.cases import build_case, build_structure
+from studies.study.signals import INPUTS, OUTPUTS, parse_signal
 from studies.study.spec import paper_study, parse_study
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import parse_tuning
@@ -26,6 +27,7 @@ FREQUENCY = np.concatenate([np.linspace(20, 200, 90), np.linspace(205, 600, 80)]
 RICH, FITTED = 12, 6
 #: Noise of a response: a share of it, and of its largest value.
 NOISE, FLOOR = 0.01, 1e-3
+ENDS = ("input", INPUTS), ("output", OUTPUTS)
 FREE = {
     "link.youngs_modulus": {"from": 60e9, "to": 80e9},
     "link.joint_inertia_c": {"from": 1e-7, "to": 5e-5, "scale": "log"},
@@ -69,6 +71,7 @@ def responses():
     """Entries of the measured responses."""
     signals = [(f"actuator {i}.{k}", f"sensor {i}.{k}") for i in (1, 2, 3) for k in (1, 2)]
     signals += [("actuator 1.2", "sensor 2.2"), ("actuator 2.2", "sensor 3.2")]
+    signals += [(f"command {i}", f"motor {i}") for i in (1, 2, 3)]
     return [
         {
             "kind": "response",
@@ -118,11 +121,11 @@ def _by_model(folder, true, entries):
 
 def _by_elements(true, entries):
     """The same by finite elements."""
-    patches = [
-        [tuple(int(x) - 1 for x in entry[end].split()[1].split(".")) for end in ("input", "output")]
+    signals = [
+        tuple(parse_signal(entry[end], kinds, 3, np.full(3, 0.2), end) for end, kinds in ENDS)
         for entry in entries
     ]
-    return response_of_elements(true, POSE, patches, FREQUENCY)
+    return response_of_elements(true, POSE, signals, FREQUENCY)
 
 
 def measured_data(folder, seed, is_elements=False, **commission):

@@ -17,12 +17,12 @@ FINE = STIFF._replace(n_steps=20)
 
 
 def response_of_elements(study, pose, signals, frequency_hz):
-    """Complex responses [V/V] from actuators to sensors of the machine at rest.
+    """Complex responses from actuators to sensors and from commands to motors, at rest.
 
     Args:
         study: the machine; its sliders are held by their drives, with friction's slope at rest.
         pose: of the platform [m, m, rad], (3,).
-        signals: ((link, patch) of the actuator, (link, patch) of the sensor), from 0, n of them.
+        signals: inputs and outputs, n pairs.
         frequency_hz: (f,).
 
     Returns:
@@ -38,13 +38,15 @@ def response_of_elements(study, pose, signals, frequency_hz):
     damping[at, at] += drive.coulomb_friction / drive.friction_speed
     free = null_space(constraint)
     mass, damping, stiffness = (free.T @ x @ free for x in (mass, damping, stiffness))
-    enter = [free.T @ _turning(model, machine, source, "actuator") for source, _ in signals]
-    leave = [free.T @ _turning(model, machine, output, "sensor") for _, output in signals]
+    enter = free.T @ np.stack([_along(model, machine, source) for source, _ in signals], axis=1)
+    leave = free.T @ np.stack([_along(model, machine, output) for _, output in signals], axis=1)
+    is_drive = np.array([source.kind == "command" for source, _ in signals])
     found = []
     for omega in 2 * np.pi * np.asarray(frequency_hz):
         dynamic = stiffness + 1j * omega * damping - omega**2 * mass
-        moved = np.linalg.solve(dynamic, np.stack(enter, axis=1))
-        found.append(np.sum(np.stack(leave, axis=1) * moved, axis=0))
+        gain = np.sum(leave * np.linalg.solve(dynamic, enter), axis=0)
+        held = drive.kp + 1j * omega * drive.kd  # force of the drive, over what it is off by
+        found.append(np.where(is_drive, held - held**2 * gain, gain))
     return np.stack(found, axis=1)
 
 
@@ -64,14 +66,20 @@ def _matrices(model):
     return mass, damping, both[:n, :n], both[n:, :n]
 
 
-def _turning(model, machine, signal, kind):
-    """Turning of a patch's one end against the other by all coordinates, times its constant."""
-    i, k = signal
+def _along(model, machine, signal):
+    """What a signal measures of all coordinates, or acts on: of a motor or command its slider.
+
+    Of a patch the turning of its one end against the other, times its constant.
+    """
+    row, i = np.zeros(len(model.reference)), signal.link
+    if signal.kind in ("command", "motor"):
+        row[model.slider_start[i]] = 1.0
+        return row
     mesh, link, start = model.meshes[i], machine.links[i], model.link_start[i]
-    constant = link.actuator_constant if kind == "actuator" else link.sensor_constant
-    nodes = mesh.actuator_nodes if kind == "actuator" else mesh.sensor_nodes
-    row = np.zeros(len(model.reference))
-    for node, sign in zip(nodes[k], (-1, 1), strict=True):
+    is_actuator = signal.kind == "actuator"
+    constant = link.actuator_constant if is_actuator else link.sensor_constant
+    nodes = mesh.actuator_nodes if is_actuator else mesh.sensor_nodes
+    for node, sign in zip(nodes[signal.patch], (-1, 1), strict=True):
         at = start + 4 * node + 2
         slope = model.reference[at : at + 2]
         row[at : at + 2] += sign * constant * np.array([-slope[1], slope[0]])

@@ -13,7 +13,7 @@ from studies.commission import run as commissioning
 from studies.commission.machines import Possible, margin_spread, margins_on, unknown_to_controller
 from studies.commission.report import CommissionFindings, summary
 from studies.commission.run import run_commission
-from studies.commission.spec import LONGER, RESERVE, parse_measured, tuning_section
+from studies.commission.spec import LOUDER, RESERVE, parse_measured, tuning_section
 from studies.commission.stages import STAGES, possible_machines
 from studies.engine.controller import fixed_controller
 from studies.engine.stability import loop_report
@@ -63,7 +63,7 @@ def test_a_tuning_is_on_the_machines_of_the_fit():
     section = tuning_section(measured, measured.study, machines)
     spec = parse_tuning(measured.study.model_dump() | {"tune": section})
     assert spec.tune.starts == 2
-    assert spec.tune.limits["gain_margin"] == RESERVE * LONGER * 3.0  # no gain was measured
+    assert spec.tune.limits["gain_margin"] == RESERVE * LOUDER * 3.0  # no gain was measured
     assert spec.tune.scenarios.machines == machines
     assert "control.gain_factor" in spec.tune.free and "control.ratios" not in spec.tune.free
 

@@ -35,8 +35,9 @@ STARTS, ITERATIONS, TUNED_ON, JUDGED_ON = 16, 60, 3, 12
 RESERVE = 1.02
 
 
-#: How much longer patches are on some plants of a certificate than in the model [1].
-LONGER = max(x.sensor for x in MISMATCHES)
+#: How much larger the gain of patches is on some plants of a certificate, whose sensors and actuators
+#: are longer than in the model [1].
+LOUDER = max(x.sensor * x.actuator for x in MISMATCHES)
 
 
 class Commission(Section):
@@ -149,10 +150,10 @@ def _check_name(field: str, value: str, allowed: list[str]) -> None:
 def certified_margin(measured: MeasuredSpec) -> float:
     """Gain margin required on every plant of the certificate [1].
 
-    Some of them have longer patches, and so a larger loop gain, which measured gains exclude.
+    Some of them have longer patches, and so louder ones, which measured gains exclude.
     """
     margin = measured.commission.gain_margin
-    return max(margin / LONGER, 1.05) if measured.measures_gains else margin
+    return max(margin / LOUDER, 1.05) if measured.measures_gains else margin
 
 
 def tuning_section(
@@ -176,7 +177,7 @@ def tuning_section(
         "starts": STARTS,
         "iterations": ITERATIONS,
     }
-    margin = RESERVE * spread * LONGER * certified_margin(measured)
+    margin = RESERVE * spread * LOUDER * certified_margin(measured)
     limits = {"gain_margin": margin} | written.get("limits", {})
     scenarios = {"count": TUNED_ON, "check": JUDGED_ON} | written.get("scenarios", {})
     if machines:
