@@ -9,7 +9,7 @@ import pytest
 import scipy.linalg
 
 from jaxmodel import sampled_loop
-from jaxmodel.linear import LinearPlant, linearise, natural_modes
+from jaxmodel.linear import linearise, natural_modes
 from jaxmodel.linear_residual import linear_residual
 from jaxmodel.parameters import HOME
 from jaxmodel.prepare import prepare
@@ -24,6 +24,7 @@ from studies.engine.stability import gain_margin, loop_report
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.margin import LOWEST
 from studies.study.spec import paper_study
+from tests.elements import plant_of_elements
 
 STUDY = paper_study()
 DATA = Path(__file__).parent / "data"
@@ -107,34 +108,9 @@ def test_margins_with_twelve_plant_modes(name):
 
 
 def finite_element_plant():
-    """The plant at home from independent finite elements, 40 cable elements a link.
-
-    As many of its modes as a plant of 12 modes a link has, and the static rest of the others.
-    """
+    """The plant at home from independent finite elements, 40 cable elements a link."""
     with np.load(DATA / "fe_plant.npz") as given:
-        fe = dict(given)
-    n, unit = 39, np.sqrt(0.0055)  # modes scaled to move as modal coordinates do
-    kept, rest = slice(n), slice(n, None)
-    static = fe["B"][rest] / fe["w2"][rest, None]
-    order = np.r_[0:3, n : n + 3, 3:n, n + 3 : 2 * n]  # of (X, X', q, q')
-    zero = np.zeros((n, n))
-    state = np.block([[zero, np.eye(n)], [-np.diag(fe["w2"][kept]), -fe["D"][kept, kept]]])
-
-    def force(x):
-        return np.vstack([0 * x[kept], x[kept]])[order] / unit
-
-    def output(x):
-        return np.hstack([x[:, kept], 0 * x[:, kept]])[:, order] * unit
-
-    return LinearPlant(
-        state=state[np.ix_(order, order)],
-        voltage=force(fe["B"]),
-        force=force(fe["F"]),
-        deflection=output(fe["W"]),
-        sensor=output(fe["S"]),
-        direct_deflection=fe["wres"] + fe["W"][:, rest] @ static,
-        direct_sensor=fe["res"] + fe["S"][:, rest] @ static,
-    )
+        return plant_of_elements(dict(given))
 
 
 @partial(jax.jit, static_argnums=0)
