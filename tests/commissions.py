@@ -139,8 +139,8 @@ def measured_data(folder, seed, is_elements=False, **commission):
 
 
 def with_control_of(true, tuned):
-    """The true machine with everything else of a tuned study."""
-    return tuned.model_copy(update={x: getattr(true, x) for x in ("link", "load", "drive")})
+    """The true machine, its motion and its windows with the controller of a tuned study."""
+    return true.model_copy(update={x: getattr(tuned, x) for x in ("control", "electronics")})
 
 
 def margin_on(true, tuned):

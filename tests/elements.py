@@ -13,6 +13,7 @@ from studies.engine.controller import fixed_controller
 from studies.engine.stability import gain_margin
 from studies.study.cases import build_case, build_structure
 from studies.study.signals import Signal
+from studies.study.window import residual_delay
 from studies.twin.law import exported_law
 from studies.twin.loop import run_twin
 from studies.twin.machine import describe_machine
@@ -114,9 +115,9 @@ def plant_of_elements(modes):
     It has as many of their modes as such a plant, and the static rest of the others.
 
     Args:
-        modes: mass-normalised, as in `tests/data/fe_plant.npz`: squared frequencies w2 (n,), damping
-            D (n, n), forces by voltages B (n, 3 K) and by slider forces F (n, 3), sensor voltages S
-            (3 K, n), chord deflections W (3 S, n), and what further modes add, res and wres.
+        modes: mass-normalised, as in `tests/data/fe_plant.npz`: squared frequencies w2 (n,),
+            damping D (n, n), forces by voltages B (n, 3 K) and by slider forces F (n, 3), sensor
+            voltages S (3 K, n), chord deflections W (3 S, n), and what others add, res and wres.
     """
     n, unit = 39, np.sqrt(0.0055)  # scaled to move as modal coordinates do
     kept, rest = slice(n), slice(n, None)
@@ -189,9 +190,10 @@ def _modes(study, pose):
 def residual_on_elements(true, tuned):
     """Residual vibration of mid-span on the worst link, rms [m], arguments as above."""
     structure, case, metrics = build_structure(true), build_case(true), true.metrics
-    plan = plan_run(structure, case, STIFF, metrics.residual_delay + metrics.residual_length)
+    delay = residual_delay(true)
+    plan = plan_run(structure, case, STIFF, delay + metrics.residual_length)
     with exported_law(tuned) as law:
         run = run_twin(describe_machine(structure, case), plan, law, STIFF)
-    start = plan.command_end + metrics.residual_delay
+    start = plan.command_end + delay
     is_late = (run.time >= start) & (run.time <= start + metrics.residual_length)
     return float(np.sqrt(np.mean(run.deflection[is_late] ** 2, axis=0)).max())

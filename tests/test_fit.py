@@ -706,3 +706,15 @@ def test_what_a_fitted_model_cannot_predict_is_said(folder, tmp_path):
     assert "check the units" in found.unpredicted[0]
     document = json.loads((tmp_path / "out" / "fit.json").read_text())
     assert document["held_out"][0]["is_noise"] is False and document["messages"]
+
+
+def test_long_files_are_thinned_or_refused(folder, tmp_path):
+    """At once, and with the number that would do."""
+    time = np.linspace(0.01, 0.059, 50_001)
+    write(tmp_path, "trace.csv", time=time, value=np.arange(len(time)))
+    with pytest.raises(
+        StudyError, match=r"data\[0\].thin = 1; allowed: 3 or more .* of 50001 rows"
+    ):
+        made(spec_of(tmp_path, TRACE))
+    _, (one,), _ = made(spec_of(tmp_path, TRACE | {"thin": 500}))
+    assert one.measured.tolist() == list(range(0, 50_001, 500))

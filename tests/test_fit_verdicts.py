@@ -10,6 +10,7 @@ import pytest
 from rich.console import Console
 from scipy.stats import chi2
 
+from studies.errors import StudyError
 from studies.fitting import run
 from studies.fitting.bench import Modes
 from studies.fitting.estimate import estimate
@@ -188,6 +189,74 @@ def test_a_machine_without_damping_has_a_next_experiment(monkeypatch):
     assert len(found) > 100 and all(0 < x.widest < 0.1 for x in found)
 
 
+def asked(monkeypatch, others=(), **own):
+    """Experiments of a machine with open moduli, near home only."""
+    monkeypatch.setattr("studies.fitting.experiment._poses", lambda _: [tuple(HOME)])
+    spec = CASES["symmetric pose"].spec(1, **({"next": own} if own else {}))
+    bench, _, _ = made(spec)
+    u = np.array([0.4, 0.5, 0.6])
+    covariance = 0.01 * np.eye(3)
+    return next_experiments(bench, spec.free, u, covariance, others, spec.fit.next)
+
+
+def test_only_instruments_that_are_owned_are_proposed(monkeypatch):
+    found = asked(
+        monkeypatch,
+        inputs=["actuator 2.1", "command"],
+        outputs=["accelerometer 3 at 0.05", "motor"],
+    )
+    texts = {x.text for x in found}
+    assert texts == {
+        "actuator 2.1 to accelerometer 3 at 0.05",
+        *(f"command {i} to accelerometer 3 at 0.05" for i in (1, 2, 3)),
+        *(f"command {i} to motor {i}" for i in (1, 2, 3)),
+    }
+    louder = asked(
+        monkeypatch,
+        inputs=["actuator 2.1"],
+        outputs=["accelerometer 3 at 0.05"],
+        sigma_percent=20.0,
+        floor_percent=2.0,
+    )
+    alone = next(x for x in found if x.text == louder[0].text)
+    assert louder[0].widest > 2 * alone.widest
+
+
+def test_measurements_at_once_complement_one_another(monkeypatch):
+    """Each alone knows one link; together they know all, better than the best one twice."""
+    own = {"inputs": ["actuator"], "outputs": ["sensor 1.1", "sensor 2.1", "sensor 3.1"]}
+    alone = asked(monkeypatch, **own)
+    program = asked(monkeypatch, **own, count=3)
+    assert [x.text for x in program[:1]] == [alone[0].text] and len(program) == 3
+    assert {x.text[-3] for x in program} == {"1", "2", "3"}
+    widest = [x.widest for x in program]
+    assert widest == sorted(widest, reverse=True) and widest[2] < 0.2 * widest[0]
+
+
+def test_exchanged_links_are_told_apart_first(monkeypatch):
+    """At home frequencies are alike for links that changed places; responses are not."""
+    exchanged = [np.array([0.6, 0.5, 0.4])]
+    found = asked(monkeypatch, exchanged)
+    assert found[0].tells_apart and " to " in found[0].text
+    (modes,) = (x for x in found if x.text.startswith("frequencies"))
+    assert not modes.tells_apart and modes.apart < 1
+    assert all(x.tells_apart for x in asked(monkeypatch))  # there is nothing to tell apart
+
+
+@pytest.mark.parametrize(
+    "own, message",
+    [
+        ({"inputs": ["hamer"]}, "fit.next.inputs = 'hamer'.*did you mean 'hammer'"),
+        ({"outputs": ["sensor 4.1"]}, "fit.next.outputs.*links 1 to 3"),
+        ({"count": 0}, "fit.next.count = 0"),
+        ({"inputs": []}, "fit.next.inputs"),
+    ],
+)
+def test_what_nobody_owns_is_refused_before_the_fit(own, message):
+    with pytest.raises(StudyError, match=message):
+        made(CASES["symmetric pose"].spec(1, next=own))
+
+
 def test_the_right_assignment_is_found_by_exchange():
     """Four of 32 starting points lead to wrong ones, whose chi square is 100 higher or more."""
     found = estimated("payload")
@@ -311,3 +380,8 @@ def test_correlated_noise_is_said_once(tmp_path):
     assert "too small" not in text and "too large" not in text
     (misfit,) = found.answer.misfits
     assert 2.0 < misfit.understated < 6.0  # sqrt(1.9 / 0.1) = 4.4, of 0.8
+    assert 15 < misfit.thin < 30 and f"by thin = {misfit.thin}" in text  # 0.9^22 = 0.1
+    thinned = estimate(
+        spec_of(tmp_path, entry | {"thin": misfit.thin}, free=MODULUS, study=machine())
+    )
+    assert not any(x.is_correlated for x in thinned.answer.misfits)

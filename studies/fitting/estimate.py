@@ -142,14 +142,16 @@ def suggest(fitted: Fitted, phases: Phases) -> Fitted:
         remedies = diagnose(fitted.spec, fitted.problem, fitted.solution.best.u)
         return fitted._replace(remedies=remedies)
     phases.begin("next experiment")
-    inputs = (
-        fitted.problem.bench,
-        fitted.problem.free,
-        fitted.answer.place,
-        fitted.answer.covariance,
-    )
     try:
-        return fitted._replace(experiments=tuple(next_experiments(*inputs)))
+        found = next_experiments(
+            fitted.problem.bench,
+            fitted.problem.free,
+            fitted.answer.place,
+            fitted.answer.covariance,
+            [x.u for x in fitted.rivals],
+            fitted.spec.fit.next,
+        )
+        return fitted._replace(experiments=tuple(found))
     except (StudyError, ArithmeticError, ValueError) as error:  # LinAlgError is a ValueError
         return fitted._replace(experiment_fault=str(error))
 

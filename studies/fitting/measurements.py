@@ -32,7 +32,9 @@ from studies.fitting.spec import (
     SettlingEntry,
     ShakenEntry,
     SpectrumEntry,
+    ThinnedEntry,
     TraceEntry,
+    own_signal,
 )
 from studies.fitting.tables import column, read_columns
 from studies.study.cases import build_structure
@@ -42,6 +44,8 @@ from studies.study.signals import INPUTS, OUTPUTS, Signal, parse_signal
 
 #: Shapes whose largest voltage is below this have no direction [V].
 SMALLEST = 1e-100
+#: Rows of a measurement that a fit takes: a minute or two of work.
+MOST_ROWS = 20_000
 #: Derivatives of the output by its quantity.
 ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 #: The same of outputs that have one quantity.
@@ -63,7 +67,7 @@ def make_bench(spec: FitSpec) -> Bench:
         is_held = isinstance(entry, ModesEntry) and entry.ends == "held"
         if isinstance(entry, PoseEntry) and not is_held:
             poses.setdefault(_pose(spec, entry), f"fit.data[{k}].pose")
-    places = _places(spec, (ShakenEntry,))
+    places = tuple(sorted({*_places(spec, (ShakenEntry,)), *_own_places(spec)}))
     bench = Bench(spec.study, spec.free.place, tuple(poses), places, spec.free.fields)
     for pose, path in poses.items():
         bench.check(pose, path)
@@ -116,6 +120,14 @@ def _places(spec: FitSpec, kinds: tuple[type[OutputEntry], ...]) -> tuple[float,
         for signal in _signals(spec, entry, f"fit.data[{k}]")
     }
     return tuple(sorted(x for x in places if not np.isnan(x)))
+
+
+def _own_places(spec: FitSpec) -> list[float]:
+    """Where the instruments of the next experiment are [m]."""
+    own, n_patches = spec.fit.next, build_structure(spec.study).n_patches
+    names = [(x, "inputs") for x in own.inputs] + [(x, "outputs") for x in own.outputs]
+    signals = [own_signal(n_patches, *name) for name in names]
+    return [x.place for x in signals if x is not None and not np.isnan(x.place)]
 
 
 def _each(value: Any, count: int, path: str) -> np.ndarray:
@@ -175,7 +187,19 @@ def _modes(spec: FitSpec, models: Models, entry: ModesEntry, path: str) -> Measu
 
 def _read(spec: FitSpec, entry: FileEntry, path: str) -> Callable[[str], np.ndarray]:
     columns = read_columns(entry.file, spec.folder, f"{path}.file")
-    return lambda name: column(columns, name, entry.file, path)
+    if not isinstance(entry, ThinnedEntry):
+        return lambda name: column(columns, name, entry.file, path)
+    rows = len(next(iter(columns.values())))
+    if rows > MOST_ROWS * entry.thin:
+        raise field_error(
+            f"{path}.thin",
+            entry.thin,
+            f"{-(-rows // MOST_ROWS)} or more for {entry.file} of {rows} rows: a fit takes up to "
+            f"{MOST_ROWS} of each measurement (of raw time records take kind = 'record')",
+            "1",
+        )
+    thinned = {name: values[:: entry.thin] for name, values in columns.items()}
+    return lambda name: column(thinned, name, entry.file, path)
 
 
 def _real(x: np.ndarray, name: str, path: str) -> np.ndarray:
@@ -207,13 +231,17 @@ def _response(spec: FitSpec, models: Models, entry: ResponseEntry, path: str) ->
     read, signals = _read(spec, entry, path), _signals(spec, entry, path)
     frequency = _real(read(entry.frequency), entry.frequency, path)
     _check_frequency(frequency, entry, path)
+    own: dict[str, Any] = {}
     if entry.magnitude:
+        if entry.unknown:
+            raise StudyError(f"{path}.unknown: has no meaning for a magnitude")
         kind: type[Magnitude | ComplexResponse] = Magnitude
         measured = _real(read(entry.magnitude), entry.magnitude, path)
         if np.any(measured < 0):
             raise StudyError(f"{path}: column {entry.magnitude!r} has negative magnitudes; in dB?")
     else:
         kind, measured = ComplexResponse, _complex(read, entry, path)
+        own = {"unknown": _unknown(entry.unknown)}
     return kind(
         entry.name,
         entry.check,
@@ -225,7 +253,13 @@ def _response(spec: FitSpec, models: Models, entry: ResponseEntry, path: str) ->
         measured,
         _noise(entry, measured, path),
         _unit(signals, ORDERS[entry.quantity]),
+        **own,
     )
+
+
+def _unknown(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Each of them once."""
+    return tuple(dict.fromkeys(names))
 
 
 def _record(spec: FitSpec, models: Models, entry: RecordEntry, path: str) -> Measurement:
@@ -250,6 +284,7 @@ def _record(spec: FitSpec, models: Models, entry: RecordEntry, path: str) -> Mea
         found.value,
         Noise(found.sigma, entry.sigma_percent / 100),
         _unit(signals, ORDERS[entry.quantity]),
+        unknown=_unknown(entry.unknown),
     )
 
 
@@ -330,6 +365,7 @@ def _trace(spec: FitSpec, models: Models, entry: TraceEntry, path: str) -> Measu
         value,
         _noise(entry, value, path),
         OUTPUTS[signal.kind][1],
+        _unknown(entry.unknown),
     )
 
 

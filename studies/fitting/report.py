@@ -68,6 +68,8 @@ def report(fitted: Fitted, images: Path | None = None) -> str:
         posterior=_posterior(fitted),
         single=_single(fitted),
         experiments=_experiments(fitted),
+        own=fitted.spec.fit.next,
+        unknown=_unknown(fitted),
         widest=" and ".join(fitted.names[k] for k in fitted.answer.directions[0].named()),
         lines=sum(isinstance(x.part, Line) for x in fitted.comparisons),
         kept=sum(not x.is_checked for x in fitted.comparisons),
@@ -200,7 +202,7 @@ def _unexplained(answer: Answer) -> list[str]:
         f"The noise of {cell(one.name)} is correlated from one value to the next "
         f"({one.autocorrelation:.2f}), as of data sampled faster than their noise changes: the "
         f"values are not independent, and uncertainties are about {one.understated:.2g} times "
-        "those given here. Take fewer values, further apart."
+        f"those given here. Take one value in {one.thin}, by thin = {one.thin} in its entry."
         for one in answer.correlated
     ]
 
@@ -350,10 +352,33 @@ def _posterior(fitted: Fitted) -> list[list[str]]:
     return rows
 
 
+def unknown_numbers(fitted: Fitted) -> dict[str, dict[str, float]]:
+    """By measurement, what nobody knew of it: gain [1], delay [s], offset [its unit]."""
+    each = {x.name: x.found(fitted.answer.values) for x in fitted.problem.measurements}
+    return {name: found for name, found in each.items() if found}
+
+
+def _unknown(fitted: Fitted) -> list[list[str]]:
+    rows = []
+    for name, found in unknown_numbers(fitted).items():
+        delay = f"{1e3 * found['delay']:.4g}" if "delay" in found else ""
+        rest = [f"{found[x]:.4g}" if x in found else "" for x in ("gain", "offset")]
+        rows.append([cell(name), rest[0], delay, rest[1]])
+    return rows
+
+
 def _experiments(fitted: Fitted) -> list[list[Any]]:
     before = float(np.sqrt(np.linalg.eigvalsh(fitted.answer.covariance)[-1]))
     rows = []
-    for one in fitted.experiments[:SHOWN]:
+    for one in fitted.experiments[: max(SHOWN, fitted.spec.fit.next.count)]:
         pose = ", ".join(f"{x:.3g}" for x in one.pose)
-        rows.append([one.text, f"({pose})", f"{one.widest / before:.3g}"])
+        told = "yes" if one.tells_apart else "no"
+        rows.append(
+            [
+                one.text,
+                f"({pose})",
+                f"{one.widest / before:.3g}",
+                *([told] if fitted.rivals else []),
+            ]
+        )
     return rows

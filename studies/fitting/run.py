@@ -15,7 +15,7 @@ from studies.engine.run_data import run_attributes
 from studies.fitting import plots
 from studies.fitting.estimate import Fitted, estimate, fit_phases, named_values, suggest
 from studies.fitting.kinds.contract import Line
-from studies.fitting.report import is_good, report, sentences, summary
+from studies.fitting.report import is_good, report, sentences, summary, unknown_numbers
 from studies.fitting.spec import FitSpec
 from studies.fitting.statistics import REGION
 from studies.publish import REPORT, announce, check_folder, publish
@@ -143,8 +143,14 @@ def document(fitted: Fitted) -> str:
             for x in fitted.rivals
         ],
         "correlation": answer.correlation.tolist(),
+        "unknown": unknown_numbers(fitted),
         "experiments": [
-            {"text": x.text, "pose": list(x.pose), "widest": float(x.widest)}
+            {
+                "text": x.text,
+                "pose": list(x.pose),
+                "widest": x.widest,
+                "tells_apart": x.tells_apart,
+            }
             for x in fitted.experiments
         ],
         "held_out": [

@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
+import numpy as np
 from pydantic import Field, ValidationError
 
 from studies.engine.preflight import check_run
@@ -23,6 +24,7 @@ from studies.space.free import (
 from studies.study.explain import explain
 from studies.study.files import find_spec, read_toml
 from studies.study.paths import as_tuples, field_unit, parse_entry
+from studies.study.signals import INPUTS, OUTPUTS, Signal, parse_signal
 from studies.study.spec import DESIGN, MACHINE, Section, Study, described, parse_study
 from studies.study.window import with_window
 
@@ -44,6 +46,10 @@ class Common(Section):
     kind: str = described(..., "-", "kind of measurement")
     name: str = described("", "-", "in messages and figures; default: its number", max_length=60)
     check: bool = described(False, "-", "held out: compared, not fitted")
+
+
+#: What may be unknown of a response.
+Unknown = tuple[Literal["gain", "delay"], ...]
 
 
 class PoseEntry(Common):
@@ -86,6 +92,18 @@ class FileEntry(OutputEntry):
     file: str = described(..., "-", "CSV, HDF5, MATLAB or UFF, beside this file")
 
 
+class ThinnedEntry(FileEntry):
+    """Fields of measurements whose rows can be thinned out."""
+
+    thin: int = described(
+        1,
+        "1",
+        "every how many rows one is kept, where noise is alike in neighbours",
+        ge=1,
+        le=10**6,
+    )
+
+
 class NoiseEntry(Section):
     """Standard deviation of the values; both parts in quadrature."""
 
@@ -102,13 +120,14 @@ class ShakenEntry(FileEntry, PoseEntry):
     )
 
 
-class ResponseEntry(ShakenEntry, NoiseEntry):
+class ResponseEntry(ShakenEntry, ThinnedEntry, NoiseEntry):
     """A frequency response."""
 
     frequency: str = described("frequency_hz", "-", "column")
     real: str = described("real", "-", "column")
     imag: str = described("imag", "-", "column")
     magnitude: str = described("", "-", "column; instead of real and imaginary part")
+    unknown: Unknown = described((), "-", "of gain and delay, what nobody knows")
 
 
 class RecordEntry(ShakenEntry):
@@ -128,12 +147,13 @@ class RecordEntry(ShakenEntry):
     to_hz: float = described(
         0.0, "Hz", "highest one; 0: 0.4 times the sample rate of the record", ge=0, le=1e5
     )
+    unknown: Unknown = described((), "-", "of gain and delay, what nobody knows")
     sigma_percent: Percent = described(
         0.2, "%", "standard deviation over the value, beside what the coherence says"
     )
 
 
-class SpectrumEntry(ShakenEntry):
+class SpectrumEntry(ShakenEntry, ThinnedEntry):
     """A power spectrum under a white input of unknown strength."""
 
     frequency: str = described("frequency_hz", "-", "column")
@@ -141,11 +161,14 @@ class SpectrumEntry(ShakenEntry):
     averages: int = described(1, "1", "independent spectra in the mean", ge=1, le=10**6)
 
 
-class TraceEntry(FileEntry, NoiseEntry):
+class TraceEntry(ThinnedEntry, NoiseEntry):
     """A signal over time of the study's motion."""
 
     time: str = described("time", "-", "column [s], from the start of the motion")
     value: str = described("value", "-", "column")
+    unknown: tuple[Literal["gain", "offset"], ...] = described(
+        (), "-", "of gain and offset, what nobody knows"
+    )
 
 
 class SettlingEntry(OutputEntry):
@@ -197,6 +220,26 @@ ENTRIES: dict[str, type[Common]] = {
 }
 
 
+#: What is measured without an input.
+MODES = "modes"
+#: What a next experiment is made with if nothing is said.
+USUAL = ("actuator", "slider", "hammer"), (MODES, "sensor", "deflection")
+
+
+class Next(Section):
+    """What the next experiment can be made with."""
+
+    inputs: tuple[str, ...] = described(
+        USUAL[0], "-", "kinds of inputs, as 'hammer', or single ones", min_length=1
+    )
+    outputs: tuple[str, ...] = described(
+        USUAL[1], "-", "the same of outputs; 'modes': their frequencies and damping", min_length=1
+    )
+    sigma_percent: Percent = described(2.0, "%", "noise of a response over its value")
+    floor_percent: Percent = described(0.2, "%", "noise over the largest value of a response")
+    count: int = described(1, "1", "measurements that are taken at once", ge=1, le=10)
+
+
 class Fit(Section):
     """What is free, and what was measured."""
 
@@ -219,6 +262,31 @@ class Fit(Section):
         0, "1", "posterior samples, with the extra 'posterior'; 0: none", ge=0, le=10**6
     )
     seed: int = described(0, "1", "of the starting points and samples", ge=0, le=10**9)
+    next: Next = Next()
+
+
+def own_signal(n_patches: int, name: str, end: str) -> Signal | None:
+    """A single signal of the next experiment; None: all of a kind.
+
+    Args:
+        n_patches: pairs of patches on each link.
+        name: as the file has it.
+        end: `inputs` or `outputs`.
+
+    Raises:
+        StudyError: there is no such signal or kind.
+    """
+    kinds = {"inputs": INPUTS, "outputs": OUTPUTS}[end]
+    if " " in name:
+        return parse_signal(name, kinds, n_patches, np.full(3, np.inf), f"fit.next.{end}")
+    allowed = [
+        *kinds,
+        *([MODES] if end == "outputs" else []),
+        *(form for form, _ in kinds.values()),
+    ]
+    if name not in allowed:
+        raise field_error(f"fit.next.{end}", name, ", ".join(allowed), hint=nearest(name, allowed))
+    return None
 
 
 class Prior(NamedTuple):

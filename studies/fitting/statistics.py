@@ -45,6 +45,10 @@ class Direction(NamedTuple):
         return [int(k) for k in np.argsort(-size) if size[k] >= NAMED * size.max()]
 
 
+#: Correlation of values that count as independent [1].
+INDEPENDENT = 0.1
+
+
 class Misfit(NamedTuple):
     """How well one measurement is met."""
 
@@ -54,6 +58,11 @@ class Misfit(NamedTuple):
     autocorrelation: float  # of neighbours: correlation [1]; 0 for noise, nan if they have no order
     is_noise: bool  # whether the residuals look like the stated noise
     is_correlated: bool  # no larger than the stated noise, but neighbours are alike
+
+    @property
+    def thin(self) -> int:
+        """Of how many values one is to be kept, so that neighbours are nearly independent."""
+        return int(np.ceil(np.log(INDEPENDENT) / np.log(self.autocorrelation)))
 
     @property
     def understated(self) -> float:

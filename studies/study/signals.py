@@ -25,7 +25,7 @@ OUTPUTS = {
     "platform": ("platform x, y or phi", "m"),
 }
 #: Those with a place along a link.
-_PLACED = ("hammer", "deflection", "accelerometer")
+PLACED = ("hammer", "deflection", "accelerometer")
 #: Direction of an accelerometer from its link's axis if none is given: across it [deg].
 ACROSS = 90.0
 _NUMBERED = re.compile(r"(\w+) ([1-9])(?:\.([1-9]))?(?: at ([0-9.eE+-]+))?(?: to ([0-9.eE+-]+))?")
@@ -45,7 +45,7 @@ class Signal(NamedTuple):
         """Its place among all signals of its kind."""
         if self.kind in ("actuator", "sensor"):
             return self.link * n_patches + self.patch
-        if self.kind in _PLACED:
+        if self.kind in PLACED:
             return self.link * len(stations) + stations.index(self.place)
         return self.link
 
@@ -79,7 +79,7 @@ def parse_signal(
     patch = int(match[3] or 1)
     if patch > n_patches:
         raise field_error(path, text, f"patches 1 to {n_patches}")
-    if (kind in _PLACED) != (match[4] is not None):
+    if (kind in PLACED) != (match[4] is not None):
         raise field_error(path, text, kinds[kind][0])
     if match[5] is not None and kind != "accelerometer":
         raise field_error(path, text, kinds[kind][0])

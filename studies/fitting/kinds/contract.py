@@ -87,7 +87,7 @@ class Measurement(ABC):
 
     kind: ClassVar[str]
     is_ordered: ClassVar[bool] = False  # neighbours in `residual` are neighbours in time, frequency
-    n_hidden: ClassVar[int] = 0  # numbers that it fits by itself
+    n_hidden: int = 0  # numbers that it fits by itself
     mean_square: float = 1.0  # of residuals that are noise [1]
     labels: tuple[str, ...] = ()  # of the numbers, with their units
 
@@ -122,6 +122,10 @@ class Measurement(ABC):
         Of measured values, those that noise made small would count more than the others. By
         default the noise is no share, or one of the measured values.
         """
+
+    def found(self, values: np.ndarray) -> dict[str, float]:
+        """Unknown numbers of its own, by name: gain [1], delay [s], offset [its unit]."""
+        return {}
 
     def compare(self, values: np.ndarray) -> Line | Numbers:
         """For figures and tables."""

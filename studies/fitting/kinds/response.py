@@ -9,6 +9,7 @@ import scipy
 
 from studies.fitting.bench import Bench, Pose, response
 from studies.fitting.kinds.contract import Line, Measurement, Noise, Residual, scaled
+from studies.fitting.kinds.unknown import GAIN, Adjusted, adjusted
 from studies.study.signals import Signal
 
 TWO_PI = 2 * np.pi
@@ -89,6 +90,25 @@ class _BenchMeasurement(Measurement):
 
 class ComplexResponse(_BenchMeasurement):
     """Real and imaginary part."""
+
+    def __init__(self, *arguments: Any, unknown: tuple[str, ...] = ()) -> None:
+        """Arguments: as above; unknown: of gain and delay."""
+        super().__init__(*arguments)
+        self.unknown, self.n_hidden = unknown, len(unknown)
+
+    def predict(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
+        model, slope, _ = self._adjusted(values, has_slopes)
+        return model, slope
+
+    def _adjusted(self, values: np.ndarray, has_slopes: bool) -> Adjusted:
+        given = *super().predict(values, has_slopes), self.measured, self.sigma
+        return adjusted(self.unknown, *given, TWO_PI * self.frequency)
+
+    def found(self, values: np.ndarray) -> dict[str, float]:
+        return self._adjusted(values, False).found
+
+    def sanity_error(self, values: np.ndarray) -> str:
+        return "" if GAIN in self.unknown else super().sanity_error(values)
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
         model, slope = self.predict(values, has_slopes)

@@ -9,6 +9,7 @@ import numpy as np
 from studies.errors import StudyError
 from studies.fitting.kinds.contract import Line, Measurement, Noise
 from studies.fitting.kinds.motions import Motion, Recording
+from studies.fitting.kinds.unknown import Adjusted, adjusted
 from studies.study.signals import Signal
 
 #: A signal that moves less is at rest [its unit].
@@ -32,6 +33,7 @@ class Trace(Measurement):
         measured: np.ndarray,
         noise: Noise,
         unit: str,
+        unknown: tuple[str, ...] = (),
     ) -> None:
         """
         Args:
@@ -42,19 +44,28 @@ class Trace(Measurement):
             measured: (n,).
             noise: of the measured values.
             unit: of the signal.
+            unknown: of gain and offset.
         """
         super().__init__(name, is_checked, measured, noise.sigma(measured))
+        self.unknown, self.n_hidden = unknown, len(unknown)
         self._motion, self._signal, self._noise, self._unit = motion, signal, noise, unit
         self.time = time
         motion.add(signal)
 
     def predict(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
+        model, slope, _ = self._adjusted(values, has_slopes)
+        return model, slope
+
+    def _adjusted(self, values: np.ndarray, has_slopes: bool) -> Adjusted:
         run = self._motion.find(self.name, self._signal, values, has_slopes)
-        model = np.interp(self.time, run.time, run.value)
-        if run.slope is None:
-            return model, None
-        by = [np.interp(self.time, run.time, x) for x in run.slope.T]
-        return model, np.stack(by, axis=1)
+        model, slope = np.interp(self.time, run.time, run.value), None
+        if run.slope is not None:
+            by = [np.interp(self.time, run.time, x) for x in run.slope.T]
+            slope = np.stack(by, axis=1)
+        return adjusted(self.unknown, model, slope, self.measured, self.sigma)
+
+    def found(self, values: np.ndarray) -> dict[str, float]:
+        return self._adjusted(values, False).found
 
     def reweigh(self, values: np.ndarray) -> None:
         self.sigma = self._noise.of_model(self.predict(values, False)[0], self.measured)
@@ -71,6 +82,8 @@ class Trace(Measurement):
         )
 
     def sanity_error(self, values: np.ndarray) -> str:
+        if self.unknown:
+            return ""
         model = self.predict(values, False)[0]
         ratio = float(np.ptp(self.measured) / max(np.ptp(model), 1e-300))
         if 0.01 < ratio < 100:

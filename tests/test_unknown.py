@@ -1,0 +1,99 @@
+"""Gain, delay and offset of a measurement that nobody knows, fitted beside the parameters."""
+
+import json
+
+import jsonschema
+import numpy as np
+import pytest
+from rich.console import Console
+from scipy.stats import chi2
+
+from studies.errors import StudyError
+from studies.fitting.estimate import fit
+from studies.fitting.run import run_fit
+from studies.show.document import schema
+from tests.fits import FREQUENCY, MAGNITUDE, RESPONSE, TIME, TRACE, blank, made, spec_of, write
+from tests.pages import tables_of
+
+GAIN, DELAY = -0.8, 3.1e-4
+UNKNOWN = {"unknown": ["gain", "delay"]}
+OWN = RESPONSE | {"output": "sensor 1.1"}
+
+
+def measure(folder, seed=0, entry=OWN):
+    """A response with a wrong gain, late, and its 3 % of noise; the true parameters."""
+    blank(folder)
+    _, (one,), truth = made(spec_of(folder, entry))
+    exact, _ = one.predict(truth, False)
+    exact = GAIN * exact * np.exp(-2j * np.pi * FREQUENCY * DELAY)
+    sigma = np.hypot(0.03 * np.abs(exact), 1e-5)
+    noise = np.random.default_rng(seed).normal(size=(2, len(exact))).T @ [1, 1j]
+    measured = exact + sigma * noise
+    columns = {"real": measured.real, "imag": measured.imag}
+    write(folder, "response.csv", frequency_hz=FREQUENCY, **columns)
+    return truth
+
+
+def test_they_are_found_beside_the_parameters(tmp_path):
+    truth = measure(tmp_path)
+    found = run_fit(spec_of(tmp_path, OWN | UNKNOWN), tmp_path / "out", Console(quiet=True))
+    assert found.answer.is_explained
+    assert 2 * len(FREQUENCY) - found.answer.freedom in (4, 5)  # one direction may be open
+    assert np.all(np.abs(found.answer.values - truth) < 4 * found.answer.sigma)
+    document = json.loads((tmp_path / "out" / "fit.json").read_text())
+    jsonschema.validate(document, schema("fit"))
+    own = document["unknown"]["response 1"]
+    assert own["gain"] == pytest.approx(GAIN, rel=0.02)
+    assert own["delay"] == pytest.approx(DELAY, abs=3e-6)
+    page = (tmp_path / "out" / "report.html").read_text()
+    (table,) = tables_of(page)["Unknown numbers of measurements"]
+    assert float(table["delay [ms]"][0]) == pytest.approx(1e3 * own["delay"], rel=1e-3)
+
+
+def test_without_them_the_model_does_not_explain_the_data(tmp_path):
+    measure(tmp_path)
+    assert not fit(spec_of(tmp_path, OWN)).answer.is_explained
+
+
+def test_uncertainties_include_them(tmp_path):
+    """Three parameters of 10 records scatter as their deviations say."""
+    away = []
+    for seed in range(10):
+        truth = measure(tmp_path, seed)
+        answer = fit(spec_of(tmp_path, OWN | UNKNOWN, starts=1, profile=False)).answer
+        away.append((answer.values - truth) / answer.sigma)
+    assert chi2.ppf(1e-3, 30) < np.sum(np.square(away)) < chi2.ppf(1 - 1e-3, 30)
+
+
+@pytest.mark.parametrize("entry", [OWN | UNKNOWN, TRACE | {"unknown": ["gain", "offset"]}])
+def test_the_slope_of_chi_square_is_exact(entry, tmp_path):
+    """Although derivatives of single values leave out how the unknown numbers move."""
+    truth = measure(tmp_path)
+    rng = np.random.default_rng(0)
+    write(tmp_path, "trace.csv", time=TIME, value=0.1 * rng.normal(size=len(TIME)))
+    _, (one,), _ = made(spec_of(tmp_path, entry))
+    place = truth * [1.02, 0.9, 1.05]
+
+    def square(x):
+        return np.sum(one.residual(x, False).value ** 2) / 2
+
+    residual = one.residual(place, True)
+    found = residual.value @ residual.slope
+    for k, step in enumerate(1e-5 * place):
+        ends = (square(place + sign * step * np.eye(3)[k]) for sign in (1, -1))
+        wanted = np.subtract(*ends) / (2 * step)
+        assert found[k] * place[k] == pytest.approx(wanted * place[k], rel=2e-4, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "entry, message",
+    [
+        (MAGNITUDE | {"unknown": ["gain"]}, "unknown: has no meaning for a magnitude"),
+        (OWN | {"unknown": ["offset"]}, "unknown.*'gain' or 'delay'"),
+        (TRACE | {"unknown": ["delay"]}, "unknown.*'gain' or 'offset'"),
+    ],
+)
+def test_what_cannot_be_unknown_is_refused(entry, message, tmp_path):
+    blank(tmp_path)
+    with pytest.raises(StudyError, match=message):
+        made(spec_of(tmp_path, entry))
