@@ -14,7 +14,7 @@ from pydantic_core import PydanticUndefined
 from jaxmodel.metrics import METRICS
 from studies.cli import app
 from studies.commission.spec import Commission
-from studies.fitting.spec import ENTRIES, Fit
+from studies.fitting.spec import ENTRIES, Fit, Next
 from studies.space.spec import Block, Screen, Sweep
 from studies.study.explain import allowed_values, unit_of
 from studies.study.spec import OWN_FIELDS, Study
@@ -111,6 +111,7 @@ def fields_text() -> str:
         _section_text("[tune.scenarios]", Scenarios),
         "## A fit",
         _section_text("[fit]", Fit),
+        _section_text("[fit.next]", Next),
     ]
     parts += [_section_text(f'[[fit.data]], kind = "{kind}"', x) for kind, x in ENTRIES.items()]
     parts += ["## A commissioning", _section_text("[commission]", Commission)]

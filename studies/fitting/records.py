@@ -94,7 +94,13 @@ def recorded_response(
     share = np.clip(coherence, 1e-6, 1.0)
     random = np.abs(value) * np.sqrt((1 - share) / (2 * averages * share))
     if not settings.has_window:  # segments are not cut out of what goes on
-        return RecordedResponse(frequency[keep], value, random, coherence, averages)
+        return RecordedResponse(
+            frequency=frequency[keep],
+            value=value,
+            sigma=random,
+            coherence=coherence,
+            averages=averages,
+        )
     blurred = (value - half.value[1 : len(frequency) + 1][keep]) / 3
     return RecordedResponse(
         frequency=frequency[keep],

@@ -84,6 +84,8 @@ def _entries(arguments: tuple[Any, ...], metadata: Iterable[Any]) -> str:
         count = f"{least} or more " if least else "a list of "
     if get_origin(inner) is tuple:
         return f"{count}lists, each of {_entries(get_args(inner), ()).removeprefix('a list of ')}"
+    if get_origin(inner) is Literal:
+        return count + allowed_values(inner, ())
     limits = _range(_limits(entry))
     return f"{count}{_PLURALS[inner]}" + (f", each {limits}" if limits else "")
 

@@ -94,7 +94,7 @@ def parse_signal(
         shortest = float(np.min(length))  # places are common to all links
         if not 0 < place < shortest:
             raise field_error(path, text, f"between 0 and {shortest:g}", "m")
-    return Signal(kind, link - 1, patch - 1, place, angle)
+    return Signal(kind=kind, link=link - 1, patch=patch - 1, place=place, angle=angle)
 
 
 def signal_name(signal: Signal) -> str:
