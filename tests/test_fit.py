@@ -519,6 +519,48 @@ def test_columns_are_separated_by_semicolons_or_tabs(mark, tmp_path):
         assert found["time"].tolist() == [0.0, 0.5] and found["value"].tolist() == [1.5, -2e-3]
 
 
+@pytest.mark.parametrize(
+    "rows, values",
+    [
+        (["0;1,5", "1;2,25"], [1.5, 2.25]),
+        (["0;0,125", "1;3"], [0.125, 3.0]),
+        (["01.02.2026;1,5", "02.02.2026;2"], [1.5, 2.0]),  # a column of dates is another one
+        (["0;1,234", "1;999"], "can be thousands or decimals"),
+    ],
+)
+def test_decimal_commas_are_those_of_their_column(rows, values, tmp_path):
+    (tmp_path / "a.csv").write_text("\n".join(["time;value", *rows]))
+    if isinstance(values, str):
+        with pytest.raises(StudyError, match=values):
+            read_columns("a.csv", tmp_path, "file")
+        return
+    found = read_columns("a.csv", tmp_path, "file")
+    assert column(found, "value", "a.csv", "file").tolist() == values
+
+
+def test_a_matlab_file_that_unpacks_to_too_much_is_refused_at_once(tmp_path):
+    zeros = np.zeros(4_000_000)
+    scipy.io.savemat(tmp_path / "a.mat", {"rec": {"x": zeros}}, do_compression=True)
+    assert "x" in read_columns("a.mat::rec", tmp_path, "file")
+    many = {f"rec{k}": {"x": zeros} for k in range(9)}
+    scipy.io.savemat(tmp_path / "b.mat", many, do_compression=True)
+    with pytest.raises(StudyError, match="unpacks to more than 256 MiB"):
+        read_columns("b.mat::rec1", tmp_path, "file")
+
+
+def test_only_columns_that_are_asked_for_have_one_length(folder, tmp_path):
+    time = np.linspace(0.01, 0.059, 50)
+    with h5py.File(tmp_path / "a.mat", "w") as file:
+        file["time"], file["value"], file["other"] = time[:, None], time[None], np.arange(7.0)
+        file["note"] = np.array([[104, 105, 33]], np.uint16)
+        file["note"].attrs["MATLAB_class"] = b"char"
+    entry = TRACE | {"file": "a.mat"}
+    _, (one,), _ = made(spec_of(tmp_path, entry))
+    assert len(one.measured) == 50 and "note" not in read_columns("a.mat", tmp_path, "file")
+    with pytest.raises(StudyError, match="differ in length: time 50, other 7; allowed: one length"):
+        made(spec_of(tmp_path, entry | {"value": "other"}))
+
+
 def test_columns_come_from_matlab(tmp_path):
     f, h = FREQUENCY, np.exp(0.01j * FREQUENCY)
     inner = {"frequency_hz": f[:, None], "real": h, "note": "hammer"}

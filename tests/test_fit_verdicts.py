@@ -222,6 +222,14 @@ def test_only_instruments_that_are_owned_are_proposed(monkeypatch):
     assert louder[0].widest > 2 * alone.widest
 
 
+def test_names_of_experiments_are_those_of_files(monkeypatch):
+    found = asked(monkeypatch, inputs=["slider 1"], outputs=["platform", "sensor 1.1"])
+    assert {x.text for x in found} == {
+        *(f"slider 1 to platform {axis}" for axis in ("x", "y", "phi")),
+        "slider 1 to sensor 1.1",
+    }
+
+
 def test_measurements_at_once_complement_one_another(monkeypatch):
     """Each alone knows one link; together they know all, better than the best one twice."""
     own = {"inputs": ["actuator"], "outputs": ["sensor 1.1", "sensor 2.1", "sensor 3.1"]}
@@ -249,6 +257,8 @@ def test_exchanged_links_are_told_apart_first(monkeypatch):
         ({"inputs": ["hamer"]}, "fit.next.inputs = 'hamer'.*did you mean 'hammer'"),
         ({"outputs": ["sensor 4.1"]}, "fit.next.outputs.*links 1 to 3"),
         ({"count": 0}, "fit.next.count = 0"),
+        ({"inputs": ["hammer 1 at 5"]}, "fit.next.inputs.*between 0 and 0.2"),
+        ({"inputs": ["hammer"], "outputs": ["motor"]}, "no output of motor belongs to an input"),
         ({"inputs": []}, "fit.next.inputs"),
     ],
 )
@@ -380,7 +390,7 @@ def test_correlated_noise_is_said_once(tmp_path):
     assert "too small" not in text and "too large" not in text
     (misfit,) = found.answer.misfits
     assert 2.0 < misfit.understated < 6.0  # sqrt(1.9 / 0.1) = 4.4, of 0.8
-    assert 15 < misfit.thin < 30 and f"by thin = {misfit.thin}" in text  # 0.9^22 = 0.1
+    assert 15 < misfit.thin < 30 and f"one value in {misfit.thin} " in text  # 0.9^22 = 0.1
     thinned = estimate(
         spec_of(tmp_path, entry | {"thin": misfit.thin}, free=MODULUS, study=machine())
     )

@@ -161,7 +161,10 @@ def test_commands_need_a_drive_without_forward_path(tmp_path):
     study = {"drive": {"kind": "computed_torque"}}
     with pytest.raises(StudyError, match="known of drive.kind = 'pd' only"):
         made(spec_of(tmp_path, MOTOR, study=study))
-    with pytest.raises(StudyError, match="sensor LINK.PATCH, slider LINK, motor LINK"):
+    own = {"inputs": ["command"], "outputs": ["motor"]}
+    with pytest.raises(StudyError, match="fit.next: command: known of drive.kind = 'pd' only"):
+        made(spec_of(tmp_path, ACCELEROMETER, study=study, next=own))
+    with pytest.raises(StudyError, match="sensor LINK.PATCH,.* slider LINK, motor LINK"):
         made(spec_of(tmp_path, TRACE | {"output": "accelerometer 1 at 0.1"}))
 
 

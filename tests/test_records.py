@@ -95,6 +95,10 @@ def test_impacts_stand_alone():
         ({"segment_s": 40.0}, r"segment_s = 40.0; allowed: 0.008 to 26.2: 4 segments or more"),
         ({"segment_s": 1e-4}, "segment_s = 0.0001; allowed"),
         ({"to_hz": 60.1}, "allowed: 3 or more, 0.5 Hz apart"),
+        ({"to_hz": 5000.0}, "to_hz = 5000.0; allowed: up to 1000, half the sample rate"),
+        ({"from_hz": 600.0}, "from_hz = 600.0; allowed: below 500"),
+        ({"value": "still"}, "the recorded output does not change"),
+        ({"value": "still", "estimator": "H2"}, "the recorded output does not change"),
         ({"source": "force"}, "no column 'force'"),
         ({"source": "still"}, "the recorded input does not change"),
         ({"time": "value"}, "time must ascend evenly"),
@@ -109,13 +113,32 @@ def test_what_is_no_record_is_refused(change, message, tmp_path):
         made(spec_of(tmp_path, RECORD | change))
 
 
-def test_a_machine_is_fitted_to_its_record(tmp_path):
+def test_units_do_not_matter():
+    """Also where squares of the numbers are none."""
+    time, source, output = recorded(two_modes, 0)
+    for settings in (HANN, HANN._replace(is_h2=True)):
+        known = recorded_response(time, source, output, settings, "data")
+        found = recorded_response(time, 1e-140 * source, 1e-141 * output, settings, "data")
+        np.testing.assert_allclose(10 * found.value, known.value, rtol=1e-9)
+        np.testing.assert_allclose(10 * found.sigma, known.sigma, rtol=1e-6)
+
+
+def test_a_record_of_too_many_frequencies_is_refused(monkeypatch, tmp_path):
+    time, source, output = recorded(two_modes, 0)
+    write(tmp_path, "record.csv", time=time, input=source, output=output)
+    monkeypatch.setattr("studies.fitting.measurements.MOST_ROWS", 500)
+    with pytest.raises(StudyError, match="segment_s = 4.0; allowed: up to 2.27 for this band"):
+        made(spec_of(tmp_path, RECORD))
+
+
+def test_a_machine_is_fitted_to_its_record(tmp_path, monkeypatch):
     """A record of 65 s made with the model's response gives the numbers back."""
     response = {k: x for k, x in RECORD.items() if k not in ("segment_s", "from_hz", "to_hz")}
     grid = np.fft.rfftfreq(LENGTH, 1 / RATE)[1:-1]
     one = np.ones(len(grid))
     write(tmp_path, "grid.csv", frequency_hz=grid, real=one, imag=one)
     exact = {"kind": "response", "file": "grid.csv", "sigma": 1.0}
+    monkeypatch.setattr("studies.fitting.measurements.MOST_ROWS", len(grid))
     _, (model,), truth = made(spec_of(tmp_path, response | exact))
     curve, _ = model.predict(truth, False)
     time, source, output = recorded(lambda f: np.r_[0, curve, 0], 3)

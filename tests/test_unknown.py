@@ -97,3 +97,16 @@ def test_what_cannot_be_unknown_is_refused(entry, message, tmp_path):
     blank(tmp_path)
     with pytest.raises(StudyError, match=message):
         made(spec_of(tmp_path, entry))
+
+
+@pytest.mark.parametrize("entry", [OWN | UNKNOWN, TRACE | {"unknown": ["gain", "offset"]}])
+def test_noise_has_no_gain(entry, tmp_path):
+    """A dead channel would be explained by a gain of 0."""
+    blank(tmp_path)
+    rng = np.random.default_rng(0)
+    noise = {"real": rng.normal(size=200), "imag": rng.normal(size=200)}
+    write(tmp_path, "response.csv", frequency_hz=FREQUENCY, **noise)
+    write(tmp_path, "trace.csv", time=TIME, value=3.0 + rng.normal(size=len(TIME)))
+    quiet = {k: x for k, x in entry.items() if k != "sigma_percent"} | {"sigma": 1.0}
+    with pytest.raises(StudyError, match="nothing that a gain could be told from"):
+        fit(spec_of(tmp_path, quiet))

@@ -40,7 +40,8 @@ def found_text(outcome: CommissionFindings) -> str:
     if outcome.fit is None:
         return "Found: nothing yet."
     numbers = "; ".join(map(_number_text, outcome.fit["numbers"]))
-    how = "the model explains the data" if outcome.fit["is_explained"] else "NOT EXPLAINED"
+    is_explained = outcome.fit["is_explained"]
+    how = "the model explains the data" if is_explained else "NOT TO BE USED, see below"
     return f"Found ({how}): {numbers}."
 
 
@@ -52,7 +53,7 @@ def _number_text(x: dict[str, Any]) -> str:
 def chosen_text(outcome: CommissionFindings) -> str:
     """Which controller was chosen."""
     if outcome.tuned is None:
-        return "Chosen: nothing."
+        return "Chosen: no controller yet."
     control, rate = outcome.tuned.control, outcome.tuned.electronics.sample_rate_hz
     gain = f"gain factor {control.gain_factor:.4g}, {rate:g} Hz"
     if outcome.is_fast:
@@ -78,7 +79,7 @@ def sure_text(outcome: CommissionFindings) -> str:
         parts.append(f"certificate {outcome.certificate['verdict']}")
     if outcome.done == "firmware" and not outcome.refusals:
         parts.append("the exported code agrees with the design")
-    return f"How sure: {'; '.join(parts) or 'nothing is'}."
+    return f"How sure: {'; '.join(parts) or 'not judged'}."
 
 
 def next_texts(outcome: CommissionFindings) -> list[str]:

@@ -41,6 +41,8 @@ PAGE, DOCUMENT = "comparison.html", "comparison.json"
 RATES = (5e3, 10e3, 20e3)
 WORDS = (0, 32, 16)
 NAME = "flexlink"
+#: Gain margin of a controller to recommend, and vibration that counts as alike [1].
+SAFE, ALIKE = 2.0, 0.05
 
 
 class Variant(NamedTuple):
@@ -77,6 +79,11 @@ class ComparedVariants(NamedTuple):
     dac_bits: int
     variants: tuple[Variant, ...]
 
+    @property
+    def is_good(self) -> bool:
+        """Whether any variant has a controller."""
+        return not all(x.fault for x in self.variants)
+
     def _repr_html_(self) -> str:
         return shown(self)
 
@@ -108,6 +115,7 @@ def compare_variants(
     if not compiler:
         raise StudyError(f"--compare: {NO_COMPILER}")
     check_codable(design.study)
+    fixed_controller(design.study)  # that there is one
     motion = find_motion(design.study)
     if motion.text:
         console.print(motion.text, soft_wrap=True)
@@ -253,19 +261,43 @@ def _verdict(x: Variant) -> str:
 
 def _rows(found: ComparedVariants) -> list[list[str]]:
     """Row of the table of each variant."""
-    rows = []
+    rows, own = [], found.study.electronics.sample_rate_hz
     for x in found.variants:
-        start = [f"{x.rate / 1e3:g}", x.arithmetic]
+        start = [f"{x.rate / 1e3:g}{' (own)' if x.rate == own else ''}", x.arithmetic]
         if x.fault:
             rows.append([*start, *[""] * (3 if found.board is None else 6), f"none: {x.fault}"])
             continue
         figures = [margin_text(x.margin, 3), f"{1e6 * x.residual:.4g}"]
-        figures.append(f"{x.rounding:.3g}" if x.word else "")
+        figures.append(f"{x.rounding:.3g}" if x.word else "no bound")
         if found.board is not None and x.load is not None:
             figures += [str(x.instructions), f"{100 * x.load:.0f} %", str(x.flash)]
         what = "studies export writes it" if x.is_exportable else _refusal(x)
         rows.append([*start, *figures, what])
     return rows
+
+
+def cheapest(found: ComparedVariants) -> Variant | None:
+    """The one that takes least of a processor among those as good as any; None: there is none.
+
+    They are exported, keep a gain margin of `SAFE`, and vibrate no more than the stillest one by
+    `ALIKE`. Without a processor the one of the lowest rate, in single precision first.
+    """
+    safe = [x for x in found.variants if x.is_exportable and x.margin >= SAFE]
+    least = min((x.residual for x in safe), default=np.nan)
+    able = [x for x in safe if x.residual <= (1 + ALIKE) * least and (x.load or 0.0) < 1]
+    return min(able, key=lambda x: (x.load or 0.0, x.rate, x.word), default=None)
+
+
+def _advice(found: ComparedVariants) -> str:
+    """Which variant to take, in words."""
+    best = cheapest(found)
+    if best is None:
+        return f"none keeps a gain margin of {SAFE:g} and fits into its sample period"
+    load = "" if best.load is None else f", {100 * best.load:.0f} % of a sample period"
+    return (
+        f"the cheapest with a gain margin of {SAFE:g} and at most {100 * ALIKE:.0f} % more "
+        f"vibration than the stillest is {best.arithmetic} at {best.rate / 1e3:g} kHz{load}"
+    )
 
 
 def _refusal(x: Variant) -> str:
@@ -283,6 +315,7 @@ def _page(found: ComparedVariants) -> str:
         found=found,
         rows=_rows(found),
         usable=len(usable),
+        advice=_advice(found),
         allowed=ALLOWED_ERROR,
     )
 

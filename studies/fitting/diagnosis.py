@@ -23,6 +23,7 @@ from studies.fitting.solve import descend_all, follow
 from studies.fitting.spec import FitSpec, number_unit, parse_fit
 from studies.fitting.statistics import misfit
 from studies.space.free import plain_numbers
+from studies.study.margin import MARGIN_MODES
 from studies.study.paths import free_fields, known_field, parts_of
 from studies.study.signals import Signal
 from studies.study.spec import DESIGN, MACHINE
@@ -77,7 +78,7 @@ def diagnose(spec: FitSpec, problem: Problem, u: np.ndarray) -> tuple[Remedy, ..
         problem: its residuals.
         u: where it ended, (p,).
     """
-    found = [*_of_data(problem, u), *_of_fields(spec, problem, u)]
+    found = [*_of_data(problem, u), *_of_fields(spec, problem, u), *_of_modes(spec, problem, u)]
     found = [x for x in found if x.after * BETTER < x.before]
     return tuple(sorted(found, key=lambda x: x.after))
 
@@ -278,6 +279,22 @@ def _of_fields(spec: FitSpec, problem: Problem, u: np.ndarray) -> list[Remedy]:
         text = f"{name}, which is fixed at {own:.4g}, is {size}"
         found.append(Remedy(text, before, 2 * float(done.cost)))
     return found
+
+
+def _of_modes(spec: FitSpec, problem: Problem, u: np.ndarray) -> list[Remedy]:
+    """A model of more modes."""
+    modes = spec.study.link.modes
+    more = min(2 * modes, MARGIN_MODES)
+    if more <= modes:
+        return []
+    link = dict(spec.data.get("link", {})) | {"modes": more}
+    try:
+        richer, at = _wide_problem(parse_fit(spec.data | {"link": link}, spec.folder), u)
+    except StudyError:  # it has none, as for a controller of as many
+        return []
+    after = min((2 * x.cost for x in descend_all(richer, [at], ITERATIONS)), default=np.inf)
+    text = f"the machine has {more} modes a link, not {modes} (link.modes)"
+    return [Remedy(text, _square(problem, u), after)]
 
 
 def _falls(residual: np.ndarray, jacobian: np.ndarray, count: int) -> np.ndarray:

@@ -51,6 +51,7 @@ class Fitted(NamedTuple):
     experiments: tuple[Experiment, ...] = ()  # the most telling first; none if the model fails
     experiment_fault: str = ""  # why none was found
     remedies: tuple[Remedy, ...] = ()  # of a misfit, the most effective first
+    is_diagnosed: bool = False  # whether remedies were sought
 
     def _repr_html_(self) -> str:
         return shown(self)
@@ -140,7 +141,7 @@ def suggest(fitted: Fitted, phases: Phases) -> Fitted:
     if not fitted.answer.is_explained:  # a wrong model does not know what it would learn
         phases.begin("next experiment", "none for a wrong model; what would mend it")
         remedies = diagnose(fitted.spec, fitted.problem, fitted.solution.best.u)
-        return fitted._replace(remedies=remedies)
+        return fitted._replace(remedies=remedies, is_diagnosed=True)
     phases.begin("next experiment")
     try:
         found = next_experiments(

@@ -196,6 +196,20 @@ def _poses(bench: Bench) -> list[Pose]:
     return kept
 
 
+def check_candidates(bench: Bench, own: Next) -> None:
+    """Refuse instruments with which nothing can be measured.
+
+    Raises:
+        StudyError: no input and output belong together.
+    """
+    if MODES not in own.outputs and not _pairs(bench, own):
+        raise StudyError(
+            f"fit.next: no output of {', '.join(own.outputs)} belongs to an input of "
+            f"{', '.join(own.inputs)}; allowed: a motor with the command of its own drive, hammers "
+            "and deflections in a basis whose ends are on the chord, or 'modes'"
+        )
+
+
 def _pairs(bench: Bench, own: Next) -> list[tuple[Signal, Signal]]:
     """Inputs and outputs that can be had; a motor answers to the command of its own drive."""
     sources = [x for name in own.inputs for x in _signals(bench, name, "inputs")]
@@ -210,11 +224,13 @@ def _pairs(bench: Bench, own: Next) -> list[tuple[Signal, Signal]]:
 
 def _signals(bench: Bench, name: str, end: str) -> list[Signal]:
     """Signals of a name: that one, or all of its kind, in the middle of the measured places."""
-    single = own_signal(bench.n_patches, name, end)
+    single = own_signal(bench.study, name, end)
     if single is not None:
         return [single]
     if name == MODES:
         return []
+    if name == "platform":
+        return [Signal(name, k, 0, np.nan) for k in range(3)]
     is_patch = name in ("actuator", "sensor")
     place = np.nan
     if name in PLACED:

@@ -11,6 +11,7 @@ from jaxmodel.metrics import METRICS
 from studies.errors import StudyError, field_error
 from studies.fitting.bench import Bench
 from studies.fitting.bench import Pose as At
+from studies.fitting.experiment import check_candidates
 from studies.fitting.kinds.contract import Measurement, Noise
 from studies.fitting.kinds.figures import Compared, Figures, Runs, Switch
 from studies.fitting.kinds.modes import HeldModes, MachineModes, Measured, check_ascending
@@ -71,6 +72,7 @@ def make_bench(spec: FitSpec) -> Bench:
     bench = Bench(spec.study, spec.free.place, tuple(poses), places, spec.free.fields)
     for pose, path in poses.items():
         bench.check(pose, path)
+    check_candidates(bench, spec.fit.next)
     return bench
 
 
@@ -105,8 +107,8 @@ def _signals(spec: FitSpec, entry: Common, path: str) -> tuple[Signal, ...]:
     source = parse_signal(entry.input, INPUTS, *sizes, f"{path}.input")
     if (source.kind == "command" or output.kind == "motor") and spec.study.drive.kind != "pd":
         raise StudyError(
-            f"{path}: responses from commands and to motors are known of drive.kind = 'pd' only, "
-            f"which has no forward path; it is {spec.study.drive.kind!r}"
+            f"{path}: responses from commands and to motors are {_PD_ONLY}; it is "
+            f"{spec.study.drive.kind!r}"
         )
     return source, output
 
@@ -124,10 +126,18 @@ def _places(spec: FitSpec, kinds: tuple[type[OutputEntry], ...]) -> tuple[float,
 
 def _own_places(spec: FitSpec) -> list[float]:
     """Where the instruments of the next experiment are [m]."""
-    own, n_patches = spec.fit.next, build_structure(spec.study).n_patches
+    own = spec.fit.next
+    for name in (*own.inputs, *own.outputs):
+        kind = name.partition(" ")[0]
+        if kind in ("command", "motor") and spec.study.drive.kind != "pd":
+            raise StudyError(f"fit.next: {name}: {_PD_ONLY}; it is {spec.study.drive.kind!r}")
     names = [(x, "inputs") for x in own.inputs] + [(x, "outputs") for x in own.outputs]
-    signals = [own_signal(n_patches, *name) for name in names]
+    signals = [own_signal(spec.study, *name) for name in names]
     return [x.place for x in signals if x is not None and not np.isnan(x.place)]
+
+
+#: Of responses from commands and to motors.
+_PD_ONLY = "known of drive.kind = 'pd' only, which has no forward path"
 
 
 def _each(value: Any, count: int, path: str) -> np.ndarray:
@@ -186,20 +196,32 @@ def _modes(spec: FitSpec, models: Models, entry: ModesEntry, path: str) -> Measu
 
 
 def _read(spec: FitSpec, entry: FileEntry, path: str) -> Callable[[str], np.ndarray]:
+    """What reads a column; all that are read have one length."""
     columns = read_columns(entry.file, spec.folder, f"{path}.file")
-    if not isinstance(entry, ThinnedEntry):
-        return lambda name: column(columns, name, entry.file, path)
-    rows = len(next(iter(columns.values())))
-    if rows > MOST_ROWS * entry.thin:
-        raise field_error(
-            f"{path}.thin",
-            entry.thin,
-            f"{-(-rows // MOST_ROWS)} or more for {entry.file} of {rows} rows: a fit takes up to "
-            f"{MOST_ROWS} of each measurement (of raw time records take kind = 'record')",
-            "1",
-        )
-    thinned = {name: values[:: entry.thin] for name, values in columns.items()}
-    return lambda name: column(thinned, name, entry.file, path)
+    thin = entry.thin if isinstance(entry, ThinnedEntry) else 1
+    lengths: dict[str, int] = {}
+
+    def read(name: str) -> np.ndarray:
+        rows = lengths[name] = len(columns.get(name, ()))
+        if isinstance(entry, ThinnedEntry) and rows > MOST_ROWS * thin:
+            raise field_error(
+                f"{path}.thin",
+                thin,
+                f"{-(-rows // MOST_ROWS)} or more for {entry.file} of {rows} rows: a fit takes up "
+                f"to {MOST_ROWS} of each measurement (of raw time records take kind = 'record')",
+                "1",
+            )
+        if name in columns:
+            columns[name] = columns[name][::thin]
+        values = column(columns, name, entry.file, path)
+        if len(set(lengths.values())) > 1:
+            sizes = ", ".join(f"{key} {size}" for key, size in lengths.items())
+            raise StudyError(
+                f"{path}: columns of {entry.file} differ in length: {sizes}; allowed: one length"
+            )
+        return values
+
+    return read
 
 
 def _real(x: np.ndarray, name: str, path: str) -> np.ndarray:
@@ -273,6 +295,14 @@ def _record(spec: FitSpec, models: Models, entry: RecordEntry, path: str) -> Mea
         band=(entry.from_hz, entry.to_hz),
     )
     found = recorded_response(time, source, output, settings, path)
+    if len(found.frequency) > MOST_ROWS:
+        longest = entry.segment_s * MOST_ROWS / len(found.frequency)
+        raise field_error(
+            f"{path}.segment_s",
+            entry.segment_s,
+            f"up to {longest:.3g} for this band: a fit takes up to {MOST_ROWS} frequencies",
+            "s",
+        )
     return ComplexResponse(
         entry.name,
         entry.check,

@@ -28,6 +28,8 @@ UNEVEN = 1e-3
 FEWEST = 4
 #: Share of the sample rate up to which responses are taken if nothing else is said [1].
 HIGHEST = 0.4
+#: A record that changes by less is still [its unit].
+SMALLEST = 1e-150
 
 
 class RecordSettings(NamedTuple):
@@ -76,8 +78,13 @@ def recorded_response(
             f"record of {last:.4g} s",
             "s",
         )
-    if not np.ptp(source) > 0:
-        raise StudyError(f"{path}: the recorded input does not change")
+    for name, x in (("input", source), ("output", output)):
+        if not np.ptp(x) > SMALLEST:
+            raise StudyError(f"{path}: the recorded {name} does not change")
+    _check_band(settings.band, step, path)
+    # of size 1, so that their powers are numbers
+    unit = np.std(output) / np.std(source)
+    source, output = source / np.std(source), output / np.std(output)
     whole = _estimate(source, output, step, size, settings)
     half = _estimate(source, output, step, size // 2, settings)
     averages = INDEPENDENT * count if settings.has_window else float(count)
@@ -90,7 +97,7 @@ def recorded_response(
             f"{path}: {int(np.sum(keep))} frequencies between from_hz = {low:g} and to_hz = "
             f"{high or HIGHEST / step:g}; allowed: 3 or more, {2 / (size * step):.3g} Hz apart"
         )
-    value, coherence = whole.value[2::2][keep], whole.coherence[2::2][keep]
+    value, coherence = unit * whole.value[2::2][keep], whole.coherence[2::2][keep]
     share = np.clip(coherence, 1e-6, 1.0)
     random = np.abs(value) * np.sqrt((1 - share) / (2 * averages * share))
     if not settings.has_window:  # segments are not cut out of what goes on
@@ -101,7 +108,7 @@ def recorded_response(
             coherence=coherence,
             averages=averages,
         )
-    blurred = (value - half.value[1 : len(frequency) + 1][keep]) / 3
+    blurred = (value - unit * half.value[1 : len(frequency) + 1][keep]) / 3
     return RecordedResponse(
         frequency=frequency[keep],
         value=value + blurred,
@@ -109,6 +116,15 @@ def recorded_response(
         coherence=coherence,
         averages=averages,
     )
+
+
+def _check_band(band: tuple[float, float], step: float, path: str) -> None:
+    low, high = band
+    if high > 0.5 / step:
+        most = f"up to {0.5 / step:.6g}, half the sample rate of the record"
+        raise field_error(f"{path}.to_hz", high, most, "Hz")
+    if low >= (high or HIGHEST / step):
+        raise field_error(f"{path}.from_hz", low, f"below {high or HIGHEST / step:.6g}", "Hz")
 
 
 def _longest(duration: float, settings: RecordSettings) -> float:

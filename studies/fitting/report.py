@@ -159,6 +159,11 @@ def sentences(fitted: Fitted) -> list[str]:
 
 def _remedies(fitted: Fitted) -> list[str]:
     """What would mend a misfit."""
+    if fitted.is_diagnosed and not fitted.remedies:
+        return [
+            "Nothing that was tried would mend it: the usual faults of complex responses, fields "
+            "of the machine that are fixed here, more modes."
+        ]
     return [
         f"Chi square would be {one.after:.4g} in place of {one.before:.4g} if this is so: "
         f"{cell(one.text)}."
@@ -202,8 +207,9 @@ def _unexplained(answer: Answer) -> list[str]:
         f"The noise of {cell(one.name)} is correlated from one value to the next "
         f"({one.autocorrelation:.2f}), as of data sampled faster than their noise changes: the "
         f"values are not independent, and uncertainties are about {one.understated:.2g} times "
-        f"those given here. Take one value in {one.thin}, by thin = {one.thin} in its entry."
-        for one in answer.correlated
+        f"those given here. Keep one value in {one.thin} of those fitted: by thin, or by shorter "
+        "segments of a record."
+        for one in (() if bad else answer.correlated)  # a wrong model correlates the others, too
     ]
 
 

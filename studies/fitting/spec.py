@@ -9,7 +9,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-import numpy as np
 from pydantic import Field, ValidationError
 
 from studies.engine.preflight import check_run
@@ -21,6 +20,7 @@ from studies.space.free import (
     join_numbers,
     plain_numbers,
 )
+from studies.study.consistency import each_link, patch_centers
 from studies.study.explain import explain
 from studies.study.files import find_spec, read_toml
 from studies.study.paths import as_tuples, field_unit, parse_entry
@@ -265,11 +265,11 @@ class Fit(Section):
     next: Next = Next()
 
 
-def own_signal(n_patches: int, name: str, end: str) -> Signal | None:
+def own_signal(study: Study, name: str, end: str) -> Signal | None:
     """A single signal of the next experiment; None: all of a kind.
 
     Args:
-        n_patches: pairs of patches on each link.
+        study: of the machine.
         name: as the file has it.
         end: `inputs` or `outputs`.
 
@@ -278,7 +278,8 @@ def own_signal(n_patches: int, name: str, end: str) -> Signal | None:
     """
     kinds = {"inputs": INPUTS, "outputs": OUTPUTS}[end]
     if " " in name:
-        return parse_signal(name, kinds, n_patches, np.full(3, np.inf), f"fit.next.{end}")
+        n_patches, length = patch_centers(study).shape[1], each_link(study.link.length)
+        return parse_signal(name, kinds, n_patches, length, f"fit.next.{end}")
     allowed = [
         *kinds,
         *([MODES] if end == "outputs" else []),

@@ -45,6 +45,8 @@ class Direction(NamedTuple):
         return [int(k) for k in np.argsort(-size) if size[k] >= NAMED * size.max()]
 
 
+#: Share by which uncertainties may be too small before correlated noise is told [1].
+SHORT = 0.05
 #: Correlation of values that count as independent [1].
 INDEPENDENT = 0.1
 
@@ -215,23 +217,24 @@ def misfit(one: Measurement, part: Residual) -> Misfit:
     autocorrelation = np.nan
     if one.is_ordered and n > 10 and square > 0:
         autocorrelation = float(np.sum(r[1:] * r[:-1]) / square)
-    is_white = (
-        np.isnan(autocorrelation) or abs(autocorrelation) < 4 / np.sqrt(n) or square < 0.25 * n
-    )
     is_small = scipy.stats.chi2.sf(square, n) >= UNLIKELY / 10
+    is_white = bool(np.isnan(autocorrelation) or abs(autocorrelation) < 4 / np.sqrt(n))
     is_correlated = False
-    if autocorrelation >= 4 / np.sqrt(n):
+    if not is_white and autocorrelation > 0:
         # as many independent squares as these have the same variance as n correlated ones
         m = n * (1 - autocorrelation**2) / (1 + autocorrelation**2)
         is_met = scipy.stats.chi2.sf(square * m / n, m) >= UNLIKELY / 10
-        is_telling = square >= 0.25 * n or correlated_scale(square / n, autocorrelation) > 1
-        is_correlated = bool(is_met and is_telling)
+        is_short = correlated_scale(square / n, autocorrelation) > 1 + SHORT
+        is_correlated = bool(is_met and is_short)
+        is_white = bool(is_met and not is_short)  # overstated noise makes up for it
+    elif square < 0.25 * n:
+        is_white = True
     return Misfit(
         name=one.name,
         size=n,
         square=square,
         autocorrelation=autocorrelation,
-        is_noise=bool(is_white and is_small and not is_correlated),
+        is_noise=is_white and bool(is_small),
         is_correlated=is_correlated,
     )
 

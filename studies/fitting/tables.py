@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import csv
+import re
+import struct
+import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import h5py
@@ -31,7 +35,7 @@ def read_columns(file: str, folder: Path, path: str) -> dict[str, np.ndarray]:
         path: where it is written, for messages.
 
     Raises:
-        StudyError: unreadable, unknown format, columns of unequal length.
+        StudyError: unreadable, unknown format, no columns.
     """
     name, _, inside = file.partition("::")
     where = folder / name
@@ -51,10 +55,8 @@ def read_columns(file: str, folder: Path, path: str) -> dict[str, np.ndarray]:
     except (OSError, ValueError, KeyError, csv.Error) as error:
         reason = (isinstance(error, OSError) and error.strerror) or error
         raise StudyError(f"{path}: {where} cannot be read ({reason})") from None
-    if len({len(x) for x in columns.values()}) != 1:
-        lengths = sorted({len(x) for x in columns.values()})
-        sizes = f"columns of {lengths[0]} to {lengths[-1]} rows" if lengths else "no columns"
-        raise StudyError(f"{path}: {where} has {sizes}; allowed: columns of one length")
+    if not columns:
+        raise StudyError(f"{path}: {where} has no columns; allowed: columns of numbers with names")
     return columns
 
 
@@ -83,7 +85,8 @@ def column(columns: dict[str, np.ndarray], name: str, file: str, path: str) -> n
     if bad.size:
         raise StudyError(
             f"{path}: {shown(file)}, column {name!r}: {bad.size} of {len(values)} entries are not "
-            f"finite numbers, the first in row {bad[0] + 1}; delete these rows"
+            f"finite numbers, the first in row {bad[0] + 1}; delete these rows, or cut a record "
+            "there"
         )
     huge = np.flatnonzero(np.abs(values) > LARGEST)
     if huge.size:
@@ -110,8 +113,6 @@ def _from_csv(where: Path) -> dict[str, np.ndarray]:
         raise ValueError("needs a row of names and one of numbers or more")
     mark = next((x for x in (";", "\t") if x in lines[0]), ",")
     rows = list(csv.reader(lines, delimiter=mark))
-    if mark == ";" and not any("." in line for line in lines[1:]):  # decimal commas
-        rows[1:] = [[x.replace(",", ".") for x in row] for row in rows[1:]]
     names = [name.strip() for name in rows[0]]
     if len(set(names)) < len(names):
         raise ValueError("two columns have one name")
@@ -120,7 +121,25 @@ def _from_csv(where: Path) -> dict[str, np.ndarray]:
         if len(row) != width:
             raise ValueError(f"row {k} has {len(row)} entries instead of {width}")
     columns = zip(*rows[1:], strict=True)
-    return {name: np.array(x, str) for name, x in zip(names, columns, strict=True)}
+    whole = zip(names, columns, strict=True)
+    return {name: np.array(x if mark == "," else _with_points(name, x), str) for name, x in whole}
+
+
+#: A whole number with commas between its thousands, or one with three decimals.
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+")
+
+
+def _with_points(name: str, cells: Sequence[str]) -> Sequence[str]:
+    """A column with decimal points where it has decimal commas."""
+    split = [x for x in cells if "," in x]
+    if not split or any("." in x for x in cells):
+        return cells
+    if len(split) < len(cells) and all(_THOUSANDS.fullmatch(x.strip()) for x in split):
+        raise ValueError(
+            f"column {shown(name)}: {shown(split[0])} beside whole numbers can be thousands or "
+            "decimals; write decimal points"
+        )
+    return [x.replace(",", ".") for x in cells]
 
 
 def _numbers(x: np.ndarray) -> np.ndarray:
@@ -134,9 +153,9 @@ def _from_hdf5(where: Path, group: str) -> dict[str, np.ndarray]:
             raise ValueError(f"{group} is not a group")
         columns = {name: x for name, x in at.items() if isinstance(x, h5py.Dataset)}
         return {
-            name: _numbers(np.asarray(x))
+            name: _numbers(np.ravel(x))
             for name, x in columns.items()
-            if x.ndim == 1 and x.dtype.kind in "iufc"
+            if max(x.shape, default=0) == x.size > 0 and x.dtype.kind in "iufc"
         }
 
 
@@ -144,11 +163,8 @@ def _from_matlab(where: Path, struct: str) -> dict[str, np.ndarray]:
     """Vectors, not scalars, of a file that MATLAB saved; since version 7.3 it is one of HDF5."""
     if h5py.is_hdf5(where):
         return _from_matlab_hdf5(where, struct)
-    read_bytes(where)  # not larger than a file may be
+    _check_unpacked(read_bytes(where))
     try:
-        sizes = [np.prod(shape, dtype=float) for _, shape, _ in scipy.io.whosmat(where)]
-        if sum(sizes) * 16 > LARGEST_FILE:
-            raise ValueError(f"unpacks to more than {LARGEST_FILE / 2**20:g} MiB")
         held = scipy.io.loadmat(where, squeeze_me=True, struct_as_record=True)
     except Exception as error:  # of any kind, for a damaged file
         raise ValueError(str(error) or "damaged") from error
@@ -164,6 +180,29 @@ def _from_matlab(where: Path, struct: str) -> dict[str, np.ndarray]:
     }
 
 
+#: Bytes that a compressed MATLAB file may unpack to.
+_UNPACKED = 4 * LARGEST_FILE
+#: Its header, and the type of a compressed variable.
+_HEADER, _COMPRESSED = 128, 15
+
+
+def _check_unpacked(content: bytes) -> None:
+    """Raise ValueError for a file of version 5 whose variables unpack to more than `_UNPACKED`."""
+    order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
+    at, total = _HEADER, 0
+    while order and at + 8 <= len(content):
+        kind, size = struct.unpack(f"{order}II", content[at : at + 8])
+        if kind == _COMPRESSED:
+            packed = content[at + 8 : at + 8 + size]
+            try:
+                total += len(zlib.decompressobj().decompress(packed, _UNPACKED - total + 1))
+            except zlib.error as error:
+                raise ValueError(str(error)) from None
+        if total > _UNPACKED:
+            raise ValueError(f"unpacks to more than {_UNPACKED / 2**20:g} MiB")
+        at += 8 + size
+
+
 def _from_matlab_hdf5(where: Path, group: str) -> dict[str, np.ndarray]:
     with open_hdf5(where) as file:
         at = file[group] if group else file
@@ -171,7 +210,10 @@ def _from_matlab_hdf5(where: Path, group: str) -> dict[str, np.ndarray]:
             raise ValueError(f"{group} is not a struct")
         columns = {}
         for name, x in at.items():
-            if isinstance(x, h5py.Dataset) and max(x.shape, default=0) == x.size > 1:
+            kind = x.attrs.get("MATLAB_class", b"")
+            is_text = kind in (b"char", "char") or "MATLAB_empty" in x.attrs
+            is_vector = isinstance(x, h5py.Dataset) and max(x.shape, default=0) == x.size > 1
+            if is_vector and not is_text:
                 values = np.ravel(x)
                 if values.dtype.names == ("real", "imag"):
                     values = values["real"] + 1j * values["imag"]

@@ -98,7 +98,9 @@ def parse_signal(
 
 
 def signal_name(signal: Signal) -> str:
-    """Its name as files write it; not of the platform."""
+    """Its name as files write it."""
+    if signal.kind == "platform":
+        return next(name for name, k in _PLATFORM.items() if k == signal.link)
     name = f"{signal.kind} {signal.link + 1}"
     if signal.kind in ("actuator", "sensor"):
         return f"{name}.{signal.patch + 1}"

@@ -9,7 +9,7 @@ import scipy
 
 from studies.fitting.bench import Bench, Pose, response
 from studies.fitting.kinds.contract import Line, Measurement, Noise, Residual, scaled
-from studies.fitting.kinds.unknown import GAIN, Adjusted, adjusted
+from studies.fitting.kinds.unknown import GAIN, Adjusted, adjusted, noise_error
 from studies.study.signals import Signal
 
 TWO_PI = 2 * np.pi
@@ -108,7 +108,9 @@ class ComplexResponse(_BenchMeasurement):
         return self._adjusted(values, False).found
 
     def sanity_error(self, values: np.ndarray) -> str:
-        return "" if GAIN in self.unknown else super().sanity_error(values)
+        if GAIN in self.unknown:
+            return noise_error(self.unknown, self.measured, self.sigma)
+        return super().sanity_error(values)
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
         model, slope = self.predict(values, has_slopes)

@@ -9,7 +9,7 @@ import numpy as np
 from studies.errors import StudyError
 from studies.fitting.kinds.contract import Line, Measurement, Noise
 from studies.fitting.kinds.motions import Motion, Recording
-from studies.fitting.kinds.unknown import Adjusted, adjusted
+from studies.fitting.kinds.unknown import Adjusted, adjusted, noise_error
 from studies.study.signals import Signal
 
 #: A signal that moves less is at rest [its unit].
@@ -83,7 +83,7 @@ class Trace(Measurement):
 
     def sanity_error(self, values: np.ndarray) -> str:
         if self.unknown:
-            return ""
+            return noise_error(self.unknown, self.measured, self.sigma)
         model = self.predict(values, False)[0]
         ratio = float(np.ptp(self.measured) / max(np.ptp(model), 1e-300))
         if 0.01 < ratio < 100:

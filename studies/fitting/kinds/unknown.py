@@ -15,6 +15,8 @@ from scipy.optimize import minimize_scalar
 GAIN, DELAY, OFFSET = "gain", "delay", "offset"
 #: Delays are sought up to this size [s], first at so many places.
 LONGEST, PLACES = 5e-3, 201
+#: Data this many times their noise may be nothing else, rms [1].
+LOUDEST = 2.0
 
 
 class Adjusted(NamedTuple):
@@ -61,6 +63,15 @@ def adjusted(
         slope = gain * slope * np.reshape(late, (-1, 1))
         slope = _without(slope, np.stack([moved[name] for name in names], axis=1), sigma)
     return Adjusted(gain * late * model + offset, slope, {name: found[name] for name in names})
+
+
+def noise_error(names: tuple[str, ...], measured: np.ndarray, sigma: np.ndarray) -> str:
+    """What is wrong with data whose gain is unknown, "" if nothing: noise has any gain of 0."""
+    still = np.mean(measured) if OFFSET in names else 0.0
+    size = float(np.sqrt(np.mean(np.abs((measured - still) / sigma) ** 2)))
+    if GAIN not in names or size > LOUDEST:
+        return ""
+    return f"measured is {size:.2g} times its noise: nothing that a gain could be told from"
 
 
 def _delay(
