@@ -16,15 +16,24 @@ from studies.commission.run import run_commission
 from studies.commission.spec import LOUDER, RESERVE, parse_measured, tuning_section
 from studies.commission.stages import STAGES, possible_machines
 from studies.engine.controller import fixed_controller
+from studies.engine.fast_motion import make_fast
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.export.firmware import build as building
 from studies.show.document import schema
 from studies.study.spec import paper_study
 from studies.tuning.spec import parse_tuning
-from tests.commissions import measured_data
+from tests.commissions import (
+    margin_on,
+    measured_data,
+    residual_on,
+    tuned_on,
+    with_control_of,
+)
+from tests.elements import margin_on_elements, residual_on_elements
 from tests.fits import RESPONSE, SHORT, blank
 from tests.pages import parsed, text_of
+from tests.test_twin import needs_exudyn
 
 STUDY = paper_study().change(link__modes=3)
 MODES = {"kind": "modes", "frequency_hz": [114.0] * 3, "sigma_hz": 0.5}
@@ -248,20 +257,31 @@ def test_what_the_data_leave_open_is_said():
     assert lines[-1].startswith("To measure next: hammer 2")
 
 
+#: Machines of the campaign; those above are measured by finite elements.
+SEEDS, BY_MODEL = range(201, 221), 215
+#: More vibration than of a controller tuned on the true machine; what no sensor resolves [m].
+WORSE, RESOLVED = 1.2, 0.25e-6
+
+
 @pytest.mark.long  # in short: each stage in its own tests, and their order above
-@pytest.mark.timeout(1800)
-def test_a_machine_made_by_a_richer_model(tmp_path):
-    """12 modes, friction, unequal links: firmware whose margin on that machine is 2 or more."""
-    whole, true = measured_data(tmp_path, 1, target="c")
-    made = run_commission(parse_measured(whole, tmp_path), tmp_path / "out")
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_machine_made_by_a_richer_model(seed, tmp_path):
+    """12 modes, friction, unequal links: firmware as good as one tuned on that machine."""
+    is_elements = seed > BY_MODEL
+    if is_elements:
+        needs_exudyn()
+    whole, true = measured_data(tmp_path, seed, is_elements, target="c")
+    measured = parse_measured(whole, tmp_path)
+    made = run_commission(measured, tmp_path / "out")
     assert made.is_good, made.outcome.refusals
     assert len(possible_machines(tmp_path / "out").values) == 64
-    tuned = made.outcome.tuned
-    names = ("link.youngs_modulus[0]", "link.youngs_modulus[1]", "link.youngs_modulus[2]")
-    values = np.array([true.link.youngs_modulus])
-    rest = tuned.change(
-        link__joint_inertia_c=true.link.joint_inertia_c,
-        link__damping_ratio=true.link.damping_ratio,
-        load__mass=true.load.mass,
-    )
-    assert margins_on(Possible(names, values), rest)[0] >= 2
+    tuned, fast = made.outcome.tuned, make_fast(true)
+    assert margin_on(true, tuned) >= 2
+    best = tuned_on(true, measured, tmp_path / "best", Console(quiet=True))
+    residual, least = (residual_on(fast, x) for x in (tuned, best))
+    assert residual <= max(WORSE * least, RESOLVED)
+    if is_elements:
+        assert margin_on_elements(with_control_of(true, tuned), tuned) >= 2
+        residual, least = (residual_on_elements(with_control_of(fast, x), x) for x in (tuned, best))
+        assert residual <= max(WORSE * least, RESOLVED)
