@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from pathlib import Path
 
 import jsonschema
 import numpy as np
@@ -14,6 +13,7 @@ import scipy.integrate
 from studies.engine.design import Design
 from studies.engine.preflight import check_run
 from studies.errors import StudyError
+from studies.reference.tables import frequencies
 from studies.show.document import json_text, schema
 from studies.study.spec import Study
 from studies.twin import compare, report
@@ -28,7 +28,6 @@ from studies.twin.run import twin_design
 from tests.test_cli import refused, run
 
 HOME = np.array([0.0, 0.0, np.pi / 6])
-DATA = Path(__file__).parent / "data"
 
 
 def needs_exudyn() -> None:
@@ -73,8 +72,7 @@ def test_free_machine_has_the_frequencies_of_another_finite_element_model():
         lambda i, t, position, rate: 2e4 * (rho[i] - position),
         Settings(n_elements=40, axial_factor=100.0),
     )
-    cases = json.loads((DATA / "frequencies.json").read_text())["cases"]
-    expected = cases["sliders_on_springs_2e4_N_per_m"]
+    expected = frequencies("sliders_on_springs_2e4_N_per_m")
     square, _ = model.system.ComputeODE2Eigenvalues(computeComplexEigenvalues=False)
     frequency = np.sqrt(np.sort(np.abs(square))[: len(expected)]) / (2 * np.pi)
     np.testing.assert_allclose(frequency, expected, rtol=1e-5)

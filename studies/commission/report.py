@@ -76,7 +76,8 @@ def sure_text(outcome: CommissionFindings) -> str:
             "possible"
         )
     if outcome.certificate is not None:
-        parts.append(f"certificate {outcome.certificate['verdict']}")
+        verdict = outcome.certificate["verdict"]
+        parts.append(f"certificate, on plants further off than those, {verdict}")
     if outcome.done == "firmware" and not outcome.refusals:
         parts.append("the exported code agrees with the design")
     return f"How sure: {'; '.join(parts) or 'not judged'}."
