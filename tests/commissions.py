@@ -9,6 +9,7 @@ from studies.engine.controller import fixed_controller
 from studies.engine.design import load_design
 from studies.engine.fast_motion import find_motion, with_own_motion
 from studies.engine.stability import loop_report
+from studies.export.fixed import dac_step_of
 from studies.export.in_the_loop import run_controller
 from studies.export.run import DAC_BITS
 from studies.fitting.measurements import make_bench, make_measurements
@@ -156,7 +157,7 @@ def margin_on(true, tuned):
 def residual_on(true, tuned):
     """Residual vibration [m] of the worst link with that controller behind the same DAC."""
     both, fixed = with_control_of(true, tuned), fixed_controller(tuned)
-    step = float(fixed.controller.voltage_limit) / (2 ** (DAC_BITS - 1) - 1)
+    step = dac_step_of(fixed.controller, DAC_BITS)
     run = run_controller(build_structure(both), build_case(both), fixed.controller, step)
     return float(np.max(run.result.metrics.residual_rms))
 

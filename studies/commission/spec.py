@@ -33,8 +33,6 @@ STARTS, ITERATIONS, TUNED_ON, JUDGED_ON = 16, 60, 3, 12
 #: Factor by which a tuning keeps more than the required gain margin, beside what possible machines
 #: differ by.
 RESERVE = 1.02
-
-
 #: How much larger the gain of patches is on some plants of a certificate, whose sensors and
 #: actuators are longer than in the model [1].
 LOUDER = max(x.sensor * x.actuator for x in MISMATCHES)

@@ -20,13 +20,13 @@ from studies.export.c_floating import floating_source
 from studies.export.c_text import Source
 from studies.export.compiler import NO_COMPILER, find_compiler
 from studies.export.firmware.boards import Board
-from studies.export.firmware.build import Built, build
+from studies.export.firmware.build import Built, build, check_tools
 from studies.export.firmware.emulator import EmulatedCode, emulated
 from studies.export.firmware.project import project_files, write_files
-from studies.export.fixed import ALLOWED_ERROR, check_words
+from studies.export.fixed import ALLOWED_ERROR, check_words, dac_step_of
 from studies.export.fixed_blocks import design_integers
 from studies.export.floating import respond
-from studies.export.in_the_loop import LoopRun, run_in_the_loop
+from studies.export.in_the_loop import LoopRun, law_of, run_in_the_loop
 from studies.export.job import check_loop
 from studies.export.run import checked_bits, checked_board
 from studies.export.verify import load_code, reference_run
@@ -110,6 +110,8 @@ def compare_variants(
     """
     console = console or Console(highlight=False, markup=False)
     bits, board = checked_bits(dac_bits), checked_board(pil)
+    if board is not None:
+        check_tools()
     out, compiler = Path(out), find_compiler()
     check_folder(out)
     if not compiler:
@@ -176,22 +178,17 @@ class _At(NamedTuple):
     compiler: list[str]
     margin: float  # with exact coefficients [1]
 
-    @property
-    def dac_step(self) -> float:
-        """[V]."""
-        return float(self.exported.controller.voltage_limit) / (2 ** (self.dac_bits - 1) - 1)
-
 
 def _floating(at: _At, rate: float) -> Variant:
     exported, scale = at.exported, float(at.exported.controller.adc_step)
-    source, step = floating_source(exported, NAME, []), at.dac_step
+    source = floating_source(exported, NAME, [])
+    step = dac_step_of(exported.controller, at.dac_bits)
+
+    def through_dac(volts: np.ndarray) -> np.ndarray:
+        return np.asarray(np.round(volts / step) * step)
+
     with load_code(exported, source, NAME, at.compiler, np.float32, np.float32) as code:
-        code.begin()
-
-        def law(codes: np.ndarray) -> np.ndarray:
-            volts = code.step(codes * scale)[0].reshape(codes.shape).astype(float)
-            return np.asarray(np.round(volts / step) * step)
-
+        law = law_of(code, scale, through_dac)
         run = run_in_the_loop(exported.structure, exported.case, law)
     variant = Variant(rate, 0, margin=at.margin, residual=_residual(run))
     return _with_cost(at, variant, source, at.codes * scale)
@@ -205,12 +202,7 @@ def _fixed(at: _At, rate: float, word: int) -> Variant:
     loop = check_loop(exported, near, f", coefficients rounded to {word} bits")
     source, wires = fixed_source(exported, fixed, NAME, [], ""), fixed.wires
     with load_code(exported, source, NAME, at.compiler, np.uint16, np.int32) as code:
-        code.begin()
-
-        def law(codes: np.ndarray) -> np.ndarray:
-            values = code.step(codes)[0].reshape(codes.shape).astype(float)
-            return (values - wires.dac_rest) * wires.dac_step
-
+        law = law_of(code, to_volts=wires.volts)
         run = run_in_the_loop(exported.structure, exported.case, law)
     variant = Variant(
         rate,

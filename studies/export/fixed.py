@@ -83,6 +83,10 @@ class Wires(NamedTuple):
     dac_step: float  # one code [V]
     feedthrough: IntegerRow | None  # sensor counts per DAC code, (3, K, K)
 
+    def volts(self, codes: np.ndarray) -> np.ndarray:
+        """Voltages of codes of the DAC [V]."""
+        return (codes - self.dac_rest) * self.dac_step
+
 
 class FixedPoint(NamedTuple):
     """A controller with channels in fixed point. Integers unless said otherwise."""
@@ -215,7 +219,7 @@ def design_wires(exported: FixedController, dac_bits: int, word: int) -> Wires:
     """
     controller = exported.controller
     rest = 2 ** (dac_bits - 1)
-    dac_step = float(controller.voltage_limit) / (rest - 1)
+    dac_step = dac_step_of(controller, dac_bits)
     code = float(controller.adc_step / controller.adc_gain)  # one ADC code at the sensor [V]
     largest = sensor_bound(controller).max() / code
     adc_bits = int(_bits(largest, word))
@@ -239,6 +243,11 @@ def design_wires(exported: FixedController, dac_bits: int, word: int) -> Wires:
         dac_step=dac_step,
         feedthrough=through,
     )
+
+
+def dac_step_of(controller: Controller, dac_bits: int) -> float:
+    """One step of a DAC whose codes span the voltage limit [V]."""
+    return float(controller.voltage_limit) / (2 ** (dac_bits - 1) - 1)
 
 
 def check_words(exported: FixedController) -> None:

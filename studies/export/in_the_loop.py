@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,17 @@ from jaxmodel.controller import Controller, adc_code, controller_step, read_back
 from jaxmodel.loop import Inputs, Loop, State, advance, filtered_voltage
 from jaxmodel.simulate import Result, Start, begin, conclude
 from studies.engine.programs import kept_jit
+
+
+class Stepping(Protocol):
+    """Code of a controller, wherever it runs."""
+
+    def begin(self) -> None:
+        """Reset the state."""
+
+    def step(self, sensor: np.ndarray) -> tuple[np.ndarray, int]:
+        """One sample: actuator values and the fault, from sensor values."""
+
 
 #: Maps ADC codes (3, K) of a sample to actuator voltages (3, K) [V] of the next one.
 Law = Callable[[np.ndarray], np.ndarray]
@@ -26,6 +37,26 @@ class LoopRun(NamedTuple):
     voltage: np.ndarray  # commands [V], (T, 3, K)
     pose: np.ndarray  # [m, m, rad], (T, 3)
     result: Result  # metrics and status, NumPy arrays
+
+
+def law_of(
+    code: Stepping,
+    sensor_step: float = 1.0,
+    to_volts: Callable[[np.ndarray], np.ndarray] = lambda values: values,
+) -> Law:
+    """A controller's code, from rest, between the ADC's codes and the actuators.
+
+    Args:
+        code: of the controller.
+        sensor_step: what it is given for one ADC code, in its own unit.
+        to_volts: from its actuator values, (3, K), to voltages [V].
+    """
+    code.begin()
+
+    def law(codes: np.ndarray) -> np.ndarray:
+        return to_volts(code.step(codes * sensor_step)[0].reshape(codes.shape).astype(float))
+
+    return law
 
 
 def run_in_the_loop(structure: Structure, case: Case, law: Law) -> LoopRun:

@@ -76,9 +76,9 @@ def export_design(
     """
     _check_arguments(target, name, dac_bits)
     bits = checked_bits(dac_bits)
-    if pil is not None and pil in BOARDS:
-        _check_processor(pil, target, is_verified)
     board = checked_board(pil)
+    if board is not None:
+        _check_processor(board.name, target, is_verified)
     out = Path(out)
     check_folder(out)
     console = console or Console(highlight=False, markup=False)
@@ -148,16 +148,15 @@ def checked_bits(dac_bits: int | None) -> int:
 
 
 def checked_board(pil: str | None) -> Board | None:
-    """The emulated processor of that name, if there are tools for it; None: none is wanted.
+    """The emulated processor of that name; None: none is wanted.
 
     Raises:
-        StudyError: another name, or a tool is missing.
+        StudyError: another name.
     """
     if pil is None:
         return None
     if pil not in BOARDS:
         raise field_error("--pil", pil, ", ".join(BOARDS), hint=nearest(pil, BOARDS))
-    check_tools()
     return BOARDS[pil]
 
 
@@ -167,6 +166,7 @@ def _check_processor(pil: str, target: str, is_verified: bool | None) -> None:
         raise StudyError(f"--pil {pil}: not allowed with --target {target}; allowed: {allowed}")
     if is_verified is False:
         raise StudyError(f"--pil {pil}: not allowed with --no-verify; leave one of them out")
+    check_tools()
 
 
 def _origin(exported: FixedController, case_id: str) -> list[str]:

@@ -21,7 +21,7 @@ from studies.export.fixed import FixedPoint, Wires, rail_samples, shaper_row
 from studies.export.fixed_blocks import FixedBlocks
 from studies.export.floating import BlockSignals
 from studies.export.floating import respond as respond_floating
-from studies.export.in_the_loop import LoopRun, replay, run_controller, run_in_the_loop
+from studies.export.in_the_loop import LoopRun, law_of, replay, run_controller, run_in_the_loop
 from studies.export.integers import Response, shifted
 from studies.export.integers import respond as respond_fixed
 from studies.export.sequences import hard_sequences, stuck_at_end
@@ -150,13 +150,8 @@ def verify_floating(
         checks += check_faults(exported, code, reference, None)
         path, shaped = reference_path(exported)
         checks.append(compare_values("shaper, the case's motion", code.shape(path), shaped, DOUBLE))
-        shape = reference.codes.shape[1:]
-        code.begin()
-        runs["C, double"] = run_in_the_loop(
-            exported.structure,
-            exported.case,
-            lambda codes: code.step(codes * step)[0].reshape(shape),
-        )
+        law = law_of(code, step)
+        runs["C, double"] = run_in_the_loop(exported.structure, exported.case, law)
     with load_code(exported, source, name, compiler, np.float32, np.float32) as code:
         volts, _ = code.respond(reference.codes * step)
         checks += check_faults(exported, code, reference, None, ", float")
@@ -188,13 +183,8 @@ def verify_fixed(
     )
     shape = reference.codes.shape[1:]
     with load_code(exported, source, name, compiler, np.uint16, np.int32) as code:
-
-        def in_volts(codes: np.ndarray) -> np.ndarray:
-            out = code.step(codes)[0].reshape(shape).astype(float)
-            return (out - fixed.wires.dac_rest) * fixed.wires.dac_step
-
-        code.begin()
-        runs["C, fixed point"] = own = run_in_the_loop(exported.structure, exported.case, in_volts)
+        law = law_of(code, to_volts=fixed.wires.volts)
+        runs["C, fixed point"] = own = run_in_the_loop(exported.structure, exported.case, law)
         sequences = {
             "recorded codes": reference.codes,
             "own run in the loop": own.codes,
@@ -433,7 +423,7 @@ def _check_error(
     Where rivals are so close that rounding decides which of them acts, no bound holds; such samples
     are left out and must be few.
     """
-    volts = (response.codes - fixed.wires.dac_rest) * fixed.wires.dac_step
+    volts = fixed.wires.volts(response.codes)
     each = np.abs(volts - reference.voltage)
     if fixed.energy is not None:
         is_other = np.any(each > fixed.error.total * (1 + 1e-9), axis=(1, 2))

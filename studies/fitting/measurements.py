@@ -105,11 +105,8 @@ def _signals(spec: FitSpec, entry: Common, path: str) -> tuple[Signal, ...]:
     if not isinstance(entry, ShakenEntry):
         return (output,)
     source = parse_signal(entry.input, INPUTS, *sizes, f"{path}.input")
-    if (source.kind == "command" or output.kind == "motor") and spec.study.drive.kind != "pd":
-        raise StudyError(
-            f"{path}: responses from commands and to motors are {_PD_ONLY}; it is "
-            f"{spec.study.drive.kind!r}"
-        )
+    what = f"{path}: responses from commands and to motors are"
+    _check_drive(spec, {source.kind, output.kind}, what)
     return source, output
 
 
@@ -128,16 +125,19 @@ def _own_places(spec: FitSpec) -> list[float]:
     """Where the instruments of the next experiment are [m]."""
     own = spec.fit.next
     for name in (*own.inputs, *own.outputs):
-        kind = name.partition(" ")[0]
-        if kind in ("command", "motor") and spec.study.drive.kind != "pd":
-            raise StudyError(f"fit.next: {name}: {_PD_ONLY}; it is {spec.study.drive.kind!r}")
+        _check_drive(spec, {name.partition(" ")[0]}, f"fit.next: {name}:")
     names = [(x, "inputs") for x in own.inputs] + [(x, "outputs") for x in own.outputs]
     signals = [own_signal(spec.study, *name) for name in names]
     return [x.place for x in signals if x is not None and not np.isnan(x.place)]
 
 
-#: Of responses from commands and to motors.
-_PD_ONLY = "known of drive.kind = 'pd' only, which has no forward path"
+def _check_drive(spec: FitSpec, kinds: set[str], what: str) -> None:
+    """Refuse commands and motors, kinds of signals, of other drives than PD."""
+    if kinds & {"command", "motor"} and spec.study.drive.kind != "pd":
+        raise StudyError(
+            f"{what} known of drive.kind = 'pd' only, which has no forward path; it is "
+            f"{spec.study.drive.kind!r}"
+        )
 
 
 def _each(value: Any, count: int, path: str) -> np.ndarray:
@@ -199,6 +199,7 @@ def _read(spec: FitSpec, entry: FileEntry, path: str) -> Callable[[str], np.ndar
     """What reads a column; all that are read have one length."""
     columns = read_columns(entry.file, spec.folder, f"{path}.file")
     thin = entry.thin if isinstance(entry, ThinnedEntry) else 1
+    thinned = {name: x[::thin] for name, x in columns.items()}
     lengths: dict[str, int] = {}
 
     def read(name: str) -> np.ndarray:
@@ -211,9 +212,7 @@ def _read(spec: FitSpec, entry: FileEntry, path: str) -> Callable[[str], np.ndar
                 f"to {MOST_ROWS} of each measurement (of raw time records take kind = 'record')",
                 "1",
             )
-        if name in columns:
-            columns[name] = columns[name][::thin]
-        values = column(columns, name, entry.file, path)
+        values = column(thinned, name, entry.file, path)
         if len(set(lengths.values())) > 1:
             sizes = ", ".join(f"{key} {size}" for key, size in lengths.items())
             raise StudyError(
@@ -249,34 +248,36 @@ def _noise(entry: NoiseEntry, value: np.ndarray, path: str) -> Noise:
     return noise
 
 
+def _shaken(
+    spec: FitSpec, models: Models, entry: ShakenEntry, signals: tuple[Signal, ...], path: str
+) -> tuple[Any, ...]:
+    """What measurements of a shaken machine begin with: which, where, from what to what."""
+    ends, order = (signals[0], signals[1]), _order(entry, signals, path)
+    return entry.name, entry.check, models.bench, _pose(spec, entry), ends, order
+
+
 def _response(spec: FitSpec, models: Models, entry: ResponseEntry, path: str) -> Measurement:
     read, signals = _read(spec, entry, path), _signals(spec, entry, path)
     frequency = _real(read(entry.frequency), entry.frequency, path)
     _check_frequency(frequency, entry, path)
-    own: dict[str, Any] = {}
     if entry.magnitude:
         if entry.unknown:
             raise StudyError(f"{path}.unknown: has no meaning for a magnitude")
-        kind: type[Magnitude | ComplexResponse] = Magnitude
         measured = _real(read(entry.magnitude), entry.magnitude, path)
         if np.any(measured < 0):
             raise StudyError(f"{path}: column {entry.magnitude!r} has negative magnitudes; in dB?")
     else:
-        kind, measured = ComplexResponse, _complex(read, entry, path)
-        own = {"unknown": _unknown(entry.unknown)}
-    return kind(
-        entry.name,
-        entry.check,
-        models.bench,
-        _pose(spec, entry),
-        (signals[0], signals[1]),
-        _order(entry, signals, path),
+        measured = _complex(read, entry, path)
+    arguments = (
+        *_shaken(spec, models, entry, signals, path),
         frequency,
         measured,
         _noise(entry, measured, path),
         _unit(signals, ORDERS[entry.quantity]),
-        **own,
     )
+    if entry.magnitude:
+        return Magnitude(*arguments)
+    return ComplexResponse(*arguments, unknown=_unknown(entry.unknown))
 
 
 def _unknown(names: tuple[str, ...]) -> tuple[str, ...]:
@@ -304,12 +305,7 @@ def _record(spec: FitSpec, models: Models, entry: RecordEntry, path: str) -> Mea
             "s",
         )
     return ComplexResponse(
-        entry.name,
-        entry.check,
-        models.bench,
-        _pose(spec, entry),
-        (signals[0], signals[1]),
-        _order(entry, signals, path),
+        *_shaken(spec, models, entry, signals, path),
         found.frequency,
         found.value,
         Noise(found.sigma, entry.sigma_percent / 100),
@@ -364,12 +360,7 @@ def _spectrum(spec: FitSpec, models: Models, entry: SpectrumEntry, path: str) ->
         )
     return Spectrum(
         entry.averages,
-        entry.name,
-        entry.check,
-        models.bench,
-        _pose(spec, entry),
-        (signals[0], signals[1]),
-        _order(entry, signals, path),
+        *_shaken(spec, models, entry, signals, path),
         frequency,
         density,
         Noise(0.0, 0.0),

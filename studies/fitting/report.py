@@ -360,8 +360,8 @@ def _posterior(fitted: Fitted) -> list[list[str]]:
 
 def unknown_numbers(fitted: Fitted) -> dict[str, dict[str, float]]:
     """By measurement, what nobody knew of it: gain [1], delay [s], offset [its unit]."""
-    each = {x.name: x.found(fitted.answer.values) for x in fitted.problem.measurements}
-    return {name: found for name, found in each.items() if found}
+    each = (x for x in fitted.problem.measurements if x.unknown)
+    return {x.name: x.found(fitted.answer.values) for x in each}
 
 
 def _unknown(fitted: Fitted) -> list[list[str]]:

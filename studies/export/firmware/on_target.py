@@ -17,7 +17,7 @@ from studies.export.firmware.build import Built, build
 from studies.export.firmware.emulator import EmulatedCode, ProgramSizes, emulated
 from studies.export.firmware.project import STACK, project_files, write_files
 from studies.export.fixed import Wires, rail_samples
-from studies.export.in_the_loop import LoopRun, run_in_the_loop
+from studies.export.in_the_loop import LoopRun, law_of, run_in_the_loop
 from studies.export.sequences import episodes
 from studies.export.verify import (
     DOUBLE,
@@ -204,15 +204,11 @@ def _compare_episodes(
 
 def _closed_loop(at: Comparison, processor: EmulatedCode, counts: dict[str, np.ndarray]) -> LoopRun:
     """The case's motion: the plant in JAX, the controller on the target, sample by sample."""
-    exported, wires = at.exported, at.wires
-    scale = 1.0 if at.is_fixed else float(exported.controller.adc_step)
-    begin = len(processor.instructions)
-    processor.begin()
-
-    def law(codes: np.ndarray) -> np.ndarray:
-        values = processor.step(codes * scale)[0].reshape(codes.shape).astype(float)
-        return values if wires is None else (values - wires.dac_rest) * wires.dac_step
-
+    exported, begin = at.exported, len(processor.instructions)
+    if at.wires is None:
+        law = law_of(processor, float(exported.controller.adc_step))
+    else:
+        law = law_of(processor, to_volts=at.wires.volts)
     run = run_in_the_loop(exported.structure, exported.case, law)
     counts["closed loop"] = np.concatenate(processor.instructions[begin:])
     return run

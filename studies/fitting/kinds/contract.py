@@ -88,6 +88,7 @@ class Measurement(ABC):
     kind: ClassVar[str]
     is_ordered: ClassVar[bool] = False  # neighbours in `residual` are neighbours in time, frequency
     n_hidden: int = 0  # numbers that it fits by itself
+    unknown: tuple[str, ...] = ()  # those of them that nobody knows and `found` tells
     mean_square: float = 1.0  # of residuals that are noise [1]
     labels: tuple[str, ...] = ()  # of the numbers, with their units
 
