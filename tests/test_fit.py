@@ -147,7 +147,7 @@ def test_modes_are_paired_by_shape(folder, bench):
     mixed = truth._replace(frequency=truth.frequency[order], shapes=truth.shapes[order] + noise)
     plant = bench.plant(one._pose, values, False)
     modes = plant.modes
-    pairs = pair_modes(mixed, modes, np.asarray(plant.value.sensor))
+    pairs = pair_modes(mixed, modes, np.asarray(plant.value.sensor @ modes.shape))
     frequency = np.abs(modes.pole[pairs.mode]) / TWO_PI
     np.testing.assert_allclose(frequency, mixed.frequency, rtol=1e-9)
     assert np.ptp(truth.frequency[:3]) < 0.02 * truth.frequency[0] and pairs.mac.min() > 0.9

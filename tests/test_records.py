@@ -126,7 +126,7 @@ def test_units_do_not_matter():
 def test_a_record_of_too_many_frequencies_is_refused(monkeypatch, tmp_path):
     time, source, output = recorded(two_modes, 0)
     write(tmp_path, "record.csv", time=time, input=source, output=output)
-    monkeypatch.setattr("studies.fitting.measurements.MOST_ROWS", 500)
+    monkeypatch.setattr("studies.fitting.entries.common.MOST_ROWS", 500)
     with pytest.raises(StudyError, match="segment_s = 4.0; allowed: up to 2.27 for this band"):
         made(spec_of(tmp_path, RECORD))
 
@@ -138,7 +138,7 @@ def test_a_machine_is_fitted_to_its_record(tmp_path, monkeypatch):
     one = np.ones(len(grid))
     write(tmp_path, "grid.csv", frequency_hz=grid, real=one, imag=one)
     exact = {"kind": "response", "file": "grid.csv", "sigma": 1.0}
-    monkeypatch.setattr("studies.fitting.measurements.MOST_ROWS", len(grid))
+    monkeypatch.setattr("studies.fitting.entries.common.MOST_ROWS", len(grid))
     _, (model,), truth = made(spec_of(tmp_path, response | exact))
     curve, _ = model.predict(truth, False)
     time, source, output = recorded(lambda f: np.r_[0, curve, 0], 3)

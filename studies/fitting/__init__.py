@@ -3,9 +3,9 @@
 In: a study with `[fit]`. Out: values with intervals, what is not identifiable, machines that the
 data leave possible, and the next experiment.
 
-- Problem: `spec` reads the file, `tables` the files of its data, `signals` names inputs and
-  outputs, `measurements` puts them together; `kinds` are the kinds of measurements, `bench` is the
-  linear machine they are predicted with.
+- Problem: `spec` reads the file, `tables` the files of its data; `records` and `decays` make
+  responses and modes of raw records; `entries` makes measurements, `measurements` all of a file;
+  `kinds` are the kinds of measurements, `bench` is the linear machine they are predicted with.
 - Answer: `problem` stacks the residuals, `solve` finds the least by multi-start, `statistics`,
   `profiles` and `posterior` say what is known, `draw` draws machines, `experiment` says what to
   measure next.

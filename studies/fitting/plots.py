@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
+from studies.fitting.decays import Diagram
 from studies.fitting.kinds.contract import Line, Numbers
 from studies.fitting.spec import number_unit
 from studies.fitting.statistics import WIDE
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from studies.fitting.estimate import Fitted
 
 #: All figures there can be.
-NAMES = ("fit", "numbers", "correlations", "profiles", "samples")
+NAMES = ("stabilisation", "fit", "numbers", "correlations", "profiles", "samples")
 #: Measurements in one figure, single numbers, and numbers whose samples are drawn.
 MOST, MOST_NUMBERS, MOST_SAMPLED = 8, 40, 6
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#999999"
@@ -27,6 +28,9 @@ def all_figures(fitted: Fitted) -> Iterator[tuple[str, Figure]]:
     """Names and figures."""
     lines = [(_plain(x.title), x.part) for x in fitted.comparisons if isinstance(x.part, Line)]
     single = [(_plain(x.title), x.part) for x in fitted.comparisons if isinstance(x.part, Numbers)]
+    diagrams = [(name, x.diagram) for name, x in single if x.diagram is not None]
+    if diagrams:
+        yield "stabilisation", stabilisation(diagrams[:MOST])
     if lines:
         yield "fit", curves(lines[:MOST])
     if single:
@@ -42,6 +46,30 @@ def all_figures(fitted: Fitted) -> Iterator[tuple[str, Figure]]:
 def _plain(text: str) -> str:
     """A user's text, which is no formula."""
     return "".join(x for x in text.replace("$", r"\$") if x.isprintable())
+
+
+def stabilisation(shown: Sequence[tuple[str, Diagram]]) -> Figure:
+    """Poles of all orders over frequency, with the spectra of what was recorded."""
+    figure, axes = new_figure(len(shown), 1, 2.6, has_shared_abscissa=False)
+    for ax, (title, one) in zip(axes[:, 0], shown, strict=True):
+        spectrum = ax.twinx()
+        spectrum.semilogy(*one.spectrum, color=GREY, lw=0.8, label="spectrum")
+        spectrum.set_ylabel("power over its peak [1]", fontsize=SMALL)
+        spectrum.grid(visible=False)
+        ax.set_zorder(spectrum.get_zorder() + 1)
+        ax.patch.set_visible(False)
+        for which, label, style in (
+            (~one.is_stable, "pole", {"color": GREY, "marker": "."}),
+            (one.is_stable, "stable pole", {"color": BLUE, "marker": "o"}),
+        ):
+            ax.plot(one.frequency[which], one.order[which], ls="", ms=3, label=label, **style)
+        for k, frequency in enumerate(one.chosen):
+            ax.axvline(frequency, color=ORANGE, lw=0.8, label="mode" if k == 0 else None)
+        ax.plot([], [], color=GREY, lw=0.8, label="spectrum")
+        ax.set(xlabel="frequency [Hz]", ylabel="order")
+        ax.set_title(title, loc="left", fontsize=9)
+    legend_above(figure, axes[0, 0])
+    return figure
 
 
 def curves(shown: Sequence[tuple[str, Line]]) -> Figure:

@@ -65,7 +65,7 @@ def recorded_response(
     Raises:
         StudyError: uneven time, records that are too short, or an input that does nothing.
     """
-    step = _step(time, path)
+    step = even_step(time, path)
     size = 2 * max(round(settings.segment / (2 * step)), 1)
     last = float(time[-1] - time[0])
     hop = size // 2 if settings.has_window else size
@@ -81,7 +81,7 @@ def recorded_response(
     for name, x in (("input", source), ("output", output)):
         if not np.ptp(x) > SMALLEST:
             raise StudyError(f"{path}: the recorded {name} does not change")
-    _check_band(settings.band, step, path)
+    check_band(settings.band, step, path)
     # of size 1, so that their powers are numbers
     unit = np.std(output) / np.std(source)
     source, output = source / np.std(source), output / np.std(output)
@@ -118,7 +118,12 @@ def recorded_response(
     )
 
 
-def _check_band(band: tuple[float, float], step: float, path: str) -> None:
+def check_band(band: tuple[float, float], step: float, path: str) -> None:
+    """Refuse a band [Hz] that a record of this sample period [s] has not.
+
+    Raises:
+        StudyError: above half the sample rate, or empty.
+    """
     low, high = band
     if high > 0.5 / step:
         most = f"up to {0.5 / step:.6g}, half the sample rate of the record"
@@ -132,8 +137,12 @@ def _longest(duration: float, settings: RecordSettings) -> float:
     return duration * (2 / (FEWEST + 1) if settings.has_window else 1 / FEWEST)
 
 
-def _step(time: np.ndarray, path: str) -> float:
-    """Sample period [s]."""
+def even_step(time: np.ndarray, path: str) -> float:
+    """Sample period of a record [s].
+
+    Raises:
+        StudyError: uneven time.
+    """
     steps = np.diff(time)
     step = float(np.mean(steps)) if len(steps) else 0.0
     if not step > 0 or np.abs(steps - step).max() > UNEVEN * step:

@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from studies.errors import printable
-from studies.fitting.kinds.contract import Line
+from studies.fitting.kinds.contract import Line, Numbers
 from studies.fitting.plots import MOST
 from studies.fitting.spec import number_unit
 from studies.fitting.statistics import REGION, UNKNOWN, Answer, Direction, Misfit, region_rise
@@ -71,6 +71,9 @@ def report(fitted: Fitted, images: Path | None = None) -> str:
         own=fitted.spec.fit.next,
         unknown=_unknown(fitted),
         widest=" and ".join(fitted.names[k] for k in fitted.answer.directions[0].named()),
+        has_diagram=any(
+            isinstance(x.part, Numbers) and x.part.diagram is not None for x in fitted.comparisons
+        ),
         lines=sum(isinstance(x.part, Line) for x in fitted.comparisons),
         kept=sum(not x.is_checked for x in fitted.comparisons),
         has_entries=any("[" in name for name in fitted.names),

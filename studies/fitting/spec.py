@@ -86,13 +86,13 @@ class OutputEntry(Common):
     output: str = described(..., "-", "what is measured")
 
 
-class FileEntry(OutputEntry):
+class FileEntry(Common):
     """Fields of measurements in a file of columns."""
 
     file: str = described(..., "-", "CSV, HDF5, MATLAB or UFF, beside this file")
 
 
-class ThinnedEntry(FileEntry):
+class ThinnedEntry(OutputEntry, FileEntry):
     """Fields of measurements whose rows can be thinned out."""
 
     thin: int = described(
@@ -111,7 +111,7 @@ class NoiseEntry(Section):
     sigma_percent: Percent | None = described(None, "%", "standard deviation over the value")
 
 
-class ShakenEntry(FileEntry, PoseEntry):
+class ShakenEntry(OutputEntry, FileEntry, PoseEntry):
     """Fields of measurements of a machine that is shaken."""
 
     input: str = described(..., "-", "what shakes the machine")
@@ -150,6 +150,34 @@ class RecordEntry(ShakenEntry):
     unknown: Unknown = described((), "-", "of gain and delay, what nobody knows")
     sigma_percent: Percent = described(
         0.2, "%", "standard deviation over the value, beside what the coherence says"
+    )
+
+
+class DecayEntry(FileEntry, PoseEntry):
+    """Raw time records of a machine that rings or moves by chance, which become its modes."""
+
+    outputs: tuple[str, ...] = described(
+        ..., "-", "what is measured; several pair the modes by their shapes", min_length=1
+    )
+    time: str = described("time", "-", "column [s], evenly spaced")
+    values: tuple[str, ...] = described((), "-", "columns; default: named as the outputs")
+    quantity: Literal["displacement", "velocity", "acceleration"] = described(
+        "displacement",
+        "-",
+        "of the outputs: as named, or their derivatives; accelerometers have none",
+    )
+    excitation: Literal["none", "ambient"] = described(
+        "none", "-", "none: it is left to ring; ambient: chance shakes it all the time"
+    )
+    segment_s: float = described(
+        0.0, "s", "a decay each; ambient: length of the correlations; 0: as long as may be", ge=0
+    )
+    from_hz: float = described(0.0, "Hz", "lowest frequency of a mode", ge=0, le=1e5)
+    to_hz: float = described(
+        0.0, "Hz", "highest one; 0: 0.4 times the sample rate of the record", ge=0, le=1e5
+    )
+    sigma_percent: Percent = described(
+        0.05, "%", "standard deviation of a pole over its size, beside what the scatter says"
     )
 
 
@@ -213,6 +241,7 @@ ENTRIES: dict[str, type[Common]] = {
     "modes": ModesEntry,
     "response": ResponseEntry,
     "record": RecordEntry,
+    "decay": DecayEntry,
     "spectrum": SpectrumEntry,
     "trace": TraceEntry,
     "settling": SettlingEntry,

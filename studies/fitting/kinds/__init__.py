@@ -2,5 +2,5 @@
 
 `contract` says what a kind does: `modes`, `response` and spectra on the linear machine, `runs` for
 signals and figures of whole motions. To add one, write a class with `residual` here, its fields in
-`studies.fitting.spec`, and make it in `studies.fitting.measurements`.
+`studies.fitting.spec`, and make it in `studies.fitting.entries`.
 """

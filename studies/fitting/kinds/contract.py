@@ -7,6 +7,8 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from studies.fitting.decays import Diagram
+
 
 class Residual(NamedTuple):
     """Model minus measurement, in standard deviations of the measurement."""
@@ -43,6 +45,7 @@ class Numbers(NamedTuple):
     model: np.ndarray  # (n,)
     sigma: np.ndarray  # of the measured ones, (n,)
     notes: tuple[str, ...] = ()  # on the model's, of the first of them
+    diagram: Diagram | None = None  # of modes from raw records
 
     @property
     def away(self) -> np.ndarray:

@@ -13,8 +13,10 @@ import numpy as np
 import scipy
 
 from studies.errors import StudyError, field_error
-from studies.fitting.bench import Bench, Modes, Pose
+from studies.fitting.bench import Bench, Modes, PlantAt, Pose
+from studies.fitting.decays import Diagram
 from studies.fitting.kinds.contract import Measurement, Numbers
+from studies.study.signals import Signal
 
 #: Modes closer than this share one subspace [1].
 NEAR = 0.03
@@ -32,7 +34,7 @@ class Measured(NamedTuple):
     sigma: np.ndarray  # [Hz], (k,)
     damping: np.ndarray | None  # [1], (k,), nan where not known
     damping_sigma: np.ndarray | None  # [1], (k,)
-    shapes: np.ndarray | None  # voltages of the sensors, (k, 3 K)
+    shapes: np.ndarray | None  # of what was measured, complex, (k, c)
 
 
 class ModelModes(NamedTuple):
@@ -46,10 +48,24 @@ class ModelModes(NamedTuple):
     mac: np.ndarray | None  # subspace MAC [1], (k,); None without shapes
 
 
+class Seen(NamedTuple):
+    """What shapes are made of."""
+
+    signals: tuple[Signal, ...]
+    orders: tuple[int, ...]  # derivatives by time of each
+
+    def shapes(self, bench: Bench, plant: PlantAt) -> np.ndarray:
+        """Of the model's modes, in any scale, (c, m)."""
+        rows = [plant.output(x, x.row(bench.n_patches, bench.stations))[0] for x in self.signals]
+        times = plant.modes.pole ** np.array(self.orders)[:, None]
+        return np.stack(rows) @ plant.modes.shape * times
+
+
 class _Modes(Measurement):
     """Measured frequencies, then those damping ratios that are known."""
 
     kind = "modes"
+    diagram: Diagram | None = None  # where they come from raw records
 
     def __init__(self, name: str, is_checked: bool, bench: Bench, modes: Measured) -> None:
         super().__init__(name, is_checked, modes.frequency, modes.sigma)
@@ -91,6 +107,7 @@ class _Modes(Measurement):
             model=self.predict(values, False)[0],
             sigma=self.sigma,
             notes=tuple(notes),
+            diagram=self.diagram,
         )
 
     def sanity_error(self, values: np.ndarray) -> str:
@@ -103,7 +120,7 @@ class _Modes(Measurement):
             return (
                 f"the shape of mode {k + 1} ({self._modes.frequency[k]:g} Hz) is only "
                 f"{model.mac[k]:.2f} alike to any of the model's (1: the same): check order "
-                "and signs of its voltages, link by link and patch by patch"
+                "and signs of what was measured: of voltages link by link and patch by patch"
             )
         ratio = float(np.median(model.frequency / self._modes.frequency))
         if not 0.1 < ratio < 10:
@@ -143,14 +160,32 @@ class MachineModes(_Modes):
     """Modes of the machine at a pose, held by its drive."""
 
     def __init__(
-        self, name: str, is_checked: bool, bench: Bench, modes: Measured, pose: Pose
+        self,
+        name: str,
+        is_checked: bool,
+        bench: Bench,
+        modes: Measured,
+        pose: Pose,
+        seen: Seen | None = None,
+        diagram: Diagram | None = None,
     ) -> None:
+        """
+        Args:
+            name, is_checked, bench, modes: see `Measurement`.
+            pose: where.
+            seen: what shapes are made of; None: the voltages of all sensors.
+            diagram: of modes from raw records.
+        """
         super().__init__(name, is_checked, bench, modes)
-        self._pose = pose
+        self._pose, self._seen, self.diagram = pose, seen, diagram
 
     def model_modes(self, values: np.ndarray, has_slopes: bool) -> ModelModes:
         plant = self._bench.plant(self._pose, values, has_slopes)
-        pairs = pair_modes(self._modes, plant.modes, plant.value.sensor)
+        if self._seen is None:
+            shapes = plant.value.sensor @ plant.modes.shape
+        else:
+            shapes = self._seen.shapes(self._bench, plant)
+        pairs = pair_modes(self._modes, plant.modes, shapes)
         pole = plant.modes.pole[pairs.mode]
         size = np.abs(pole)
         by_frequency = by_damping = None
@@ -191,13 +226,13 @@ class Pairs(NamedTuple):
     mac: np.ndarray  # subspace MAC [1], (k,); 1 without shapes
 
 
-def pair_modes(measured: Measured, modes: Modes, sensor: np.ndarray) -> Pairs:
+def pair_modes(measured: Measured, modes: Modes, seen: np.ndarray) -> Pairs:
     """Find the model's modes that belong to the measured ones.
 
     Args:
         measured: with shapes, or without: then the nearest frequencies in their order.
         modes: of the model.
-        sensor: voltages of the sensors, rows over the state, (3 K, n).
+        seen: shapes of the model's modes, of what was measured, (c, m).
 
     Raises:
         StudyError: more measured modes than the model has.
@@ -210,7 +245,6 @@ def pair_modes(measured: Measured, modes: Modes, sensor: np.ndarray) -> Pairs:
         _, mode = scipy.optimize.linear_sum_assignment(apart)
         mode = mode[np.argsort(frequency[mode])]  # crossed pairs may be as near, but not as alike
         return Pairs(mode, modes.shape[:, mode], modes.dual[mode], np.ones(len(mode)))
-    seen = sensor @ modes.shape  # (3 K, m)
     mac = np.array(
         [
             [_share(shape, seen[:, _near(frequency, k, NEAR)]) for k in range(len(frequency))]

@@ -1,0 +1,168 @@
+"""Modes from records of free decays and of ambient vibration."""
+
+import numpy as np
+import pytest
+
+from studies.errors import StudyError
+from studies.fitting.decays import DecaySettings, decay_modes
+from studies.fitting.estimate import fit
+from studies.fitting.plots import all_figures
+from tests.fits import ASKEW, made, spec_of, write
+
+HERTZ, DAMPING = np.array([112.0, 115.0, 118.0, 455.0]), np.array([0.01, 0.012, 0.008, 0.006])
+SHAPES = np.array([[1.0, 0.5, 0.2], [-0.4, 1.0, 0.3], [0.2, -0.5, 1.0], [0.6, 0.3, -0.8]])
+FREE = DecaySettings(segment=1.0, is_ambient=False, band=(60.0, 600.0))
+AMBIENT = DecaySettings(segment=0.0, is_ambient=True, band=(60.0, 600.0))
+SENSORS = ["sensor 1.1", "sensor 2.1", "sensor 3.1"]
+DECAY = {
+    "kind": "decay",
+    "pose": ASKEW,
+    "file": "decay.csv",
+    "outputs": SENSORS,
+    "from_hz": 60.0,
+    "to_hz": 300.0,
+}
+LINKS = {"link": {"modes": 3, "damping_ratio": 0.012, "youngs_modulus": [66e9, 70e9, 75e9]}}
+MACHINE = {
+    "link.stiffness_factor": {"from": 0.8, "to": 1.2},
+    "link.damping_ratio": {"from": 0.002, "to": 0.04},
+}
+
+
+def decays(seed, noise, rate=5000.0, count=4):
+    """Time and three signals of free decays of 1 s, one after another."""
+    rng, time = np.random.default_rng(seed), np.arange(int(rate)) / rate
+    omega = 2 * np.pi * HERTZ
+    course = np.exp(np.outer(time, omega * (1j * np.sqrt(1 - DAMPING**2) - DAMPING)))
+    parts = [
+        (course * (rng.normal(size=4) * np.exp(1j * rng.uniform(0, 6, 4)))).real @ SHAPES
+        for _ in range(count)
+    ]
+    signals = np.concatenate(parts)
+    return np.arange(len(signals)) / rate, signals + noise * rng.normal(size=signals.shape)
+
+
+def ambient(seed, noise, rate=2000.0, duration=120.0):
+    """Time and three signals of modes that white noise shakes."""
+    rng, count = np.random.default_rng(seed), int(rate * duration)
+    s = 2j * np.pi * np.fft.rfftfreq(count, 1 / rate)
+    signals = np.zeros((count, 3))
+    for hertz, damping, shape in zip(HERTZ, DAMPING, SHAPES, strict=True):
+        omega = 2 * np.pi * hertz
+        law = omega**1.5 / (s**2 + 2 * damping * omega * s + omega**2)
+        signals += np.fft.irfft(np.fft.rfft(rng.normal(size=count)) * law)[:, None] * shape
+    signals /= signals.std(axis=0)
+    return np.arange(count) / rate, signals + noise * rng.normal(size=signals.shape)
+
+
+@pytest.mark.parametrize(
+    "record, noise, settings",
+    [
+        (decays, 0.01, FREE),
+        (decays, 0.1, FREE),
+        pytest.param(ambient, 0.1, AMBIENT, marks=pytest.mark.long),
+    ],
+)
+def test_modes_are_within_their_standard_deviations(record, noise, settings):
+    """No bias, and scatter as said, to a quarter over 20 records; three modes within 6 Hz."""
+    away, whole = [], 0
+    for seed in range(20):
+        found = decay_modes(*record(seed, noise), settings, "data")
+        for k in range(4):
+            near = int(np.argmin(np.abs(found.frequency - HERTZ[k])))
+            if abs(found.frequency[near] - HERTZ[k]) < 1.5:
+                away.append((found.frequency[near] - HERTZ[k]) / found.sigma[near])
+                away.append((found.damping[near] - DAMPING[k]) / found.damping_sigma[near])
+        whole += len(found.frequency) == 4
+    assert whole >= 14 and len(away) >= 140
+    assert np.std(away) == pytest.approx(1, abs=0.25) and abs(np.mean(away)) < 0.25
+
+
+def test_shapes_are_those_of_the_modes():
+    found = decay_modes(*decays(0, 0.01), FREE, "data")
+    for shape, true in zip(found.shapes, SHAPES, strict=True):
+        mac = abs(shape.conj() @ true) ** 2 / np.linalg.norm(shape) ** 2 / np.linalg.norm(true) ** 2
+        assert mac > 0.995
+
+
+def test_two_minutes_of_ambient_vibration_give_four_modes():
+    found = decay_modes(*ambient(1, 0.1), AMBIENT, "data")
+    np.testing.assert_allclose(found.frequency, HERTZ, rtol=0.004)
+    assert np.all(np.abs(found.damping - DAMPING) < 4 * found.damping_sigma)
+
+
+def test_the_diagram_has_stable_columns_at_the_modes():
+    diagram = decay_modes(*decays(0, 0.02), FREE, "data").diagram
+    for hertz in HERTZ:
+        near = diagram.is_stable & (np.abs(diagram.frequency - hertz) < 1)
+        assert len(set(diagram.order[near])) >= 15
+    assert diagram.is_stable.sum() < diagram.is_stable.size
+
+
+@pytest.fixture(scope="module")
+def shaken(tmp_path_factory):
+    """A file with three decays of 0.5 s of the machine after impulses of one actuator each."""
+    folder = tmp_path_factory.mktemp("decays")
+    rate, rng = 10000.0, np.random.default_rng(3)  # above all its modes
+    write(
+        folder, "decay.csv", time=np.arange(15000) / rate, **dict.fromkeys(SENSORS, np.ones(15000))
+    )
+    modes = {"kind": "modes", "pose": ASKEW, "frequency_hz": [100.0], "sigma_hz": 1.0}
+    bench, _, values = made(spec_of(folder, modes, free=MACHINE, study=LINKS))
+    plant = bench.plant(tuple(ASKEW), values, False)
+    pole, right, left = plant.eigen
+    rows = plant.value.sensor[[0, 2, 4]] if bench.n_patches == 2 else plant.value.sensor[::3]
+    course = np.exp(np.outer(np.arange(5000) / rate, pole))
+    parts = []
+    for link in range(3):
+        start = left @ plant.value.actuator[:, link * bench.n_patches]
+        parts.append(((course * start) @ right.T @ rows.T).real)
+    signals = np.concatenate(parts) / np.std(parts)
+    signals += 0.002 * rng.normal(size=signals.shape)
+    columns = dict(zip(SENSORS, signals.T, strict=True))
+    write(folder, "decay.csv", time=np.arange(15000) / rate, **columns)
+    return folder
+
+
+def test_a_fit_to_decays_finds_the_machine(shaken):
+    """Stiffness and damping, from a guess that is 4 % and 40 % off; three modes within 7 Hz."""
+    start = {"link": LINKS["link"] | {"damping_ratio": 0.017, "stiffness_factor": 0.96}}
+    entry = DECAY | {"segment_s": 0.5, "to_hz": 700.0}
+    spec = spec_of(shaken, entry, free=MACHINE, study=start, starts=4, profile=False)
+    fitted = fit(spec)
+    for k, true in enumerate((1.0, 0.012)):
+        assert abs(fitted.answer.values[k] - true) < 3 * fitted.answer.sigma[k]
+        assert fitted.answer.sigma[k] < (0.001, 0.001)[k]
+    part = fitted.comparisons[0].part
+    assert fitted.answer.is_explained and len(part.labels) == 12
+    assert all("shape" in note for note in part.notes)
+    assert "stabilisation" in dict(all_figures(fitted))
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        ({"outputs": []}, "outputs"),
+        ({"outputs": ["sensor 1.1", "sensor 1.1"]}, "each output once"),
+        ({"outputs": ["motor 1"]}, "sensor LINK.PATCH"),
+        ({"values": ["sensor 1.1"]}, "3 columns"),
+        ({"segment_s": 0.01}, "0.12 to 1.5"),
+        ({"segment_s": 5.0}, "1.5, the length of the record"),
+        ({"to_hz": 6000.0}, "half the sample rate"),
+        ({"from_hz": 250.0, "segment_s": 0.5}, "no mode from 250 to 300 Hz"),
+        ({"excitation": "ambient"}, "3.84 s or more"),
+        ({"excitation": "chance"}, "'none' or 'ambient'"),
+        ({"damping": True}, "damping"),
+    ],
+)
+def test_bad_entries_are_refused(shaken, change, said):
+    with pytest.raises(StudyError, match=said):
+        made(spec_of(shaken, DECAY | change))
+
+
+def test_a_dead_channel_is_named(shaken, tmp_path):
+    time = np.arange(2000) / 2000.0
+    columns = dict(zip(SENSORS, (np.sin(700 * time), 0 * time, np.cos(700 * time)), strict=True))
+    write(tmp_path, "decay.csv", time=time, **columns)
+    with pytest.raises(StudyError, match="signal 2 does not change"):
+        made(spec_of(tmp_path, DECAY))
