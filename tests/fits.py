@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from studies.fitting.kinds.modes import TWO_PI
 from studies.fitting.measurements import guess, make_bench, make_measurements
 from studies.fitting.spec import parse_fit
 
@@ -105,3 +106,34 @@ def made(spec, bench=None):
     """Bench and measurements; bench: one that serves all entries, whose programs are compiled."""
     bench = bench or make_bench(spec)
     return bench, make_measurements(spec, bench), guess(spec)
+
+
+def measured_modes(bench, one, values):
+    """The model's own modes as if they were measured."""
+    plant = bench.plant(one._pose, values, False)
+    modes = plant.modes
+    frequency = np.abs(modes.pole) / TWO_PI
+    bending = np.flatnonzero(frequency > 60)[: len(one._modes.frequency)]
+    return one._modes._replace(
+        frequency=frequency[bending],
+        damping=(-modes.pole.real / np.abs(modes.pole))[bending],
+        shapes=(np.asarray(plant.value.sensor) @ modes.shape[:, bending]).T,
+    )
+
+
+def give_data(bench, one, values, rng):
+    """What the model with these values would be measured as, with the noise of the measurement."""
+    if one.kind == "modes":
+        one.use(measured_modes(bench, one, values))
+        one.measured = one.measured + one.sigma * rng.normal(size=one.measured.shape)
+        return
+    exact, _ = one.predict(values, False)
+    if one.kind == "spectrum":
+        one.measured = np.abs(exact) ** 2 * rng.gamma(64, 1 / 64, len(exact))
+        return
+    one.reweigh(values)
+    if np.isrealobj(one.measured):
+        one.measured = np.abs(exact) if np.iscomplexobj(exact) else exact
+        one.measured = one.measured + one.sigma * rng.normal(size=len(exact))
+    else:
+        one.measured = exact + one.sigma * (rng.normal(size=(2, len(exact))).T @ [1, 1j])

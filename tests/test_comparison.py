@@ -45,6 +45,8 @@ def compared(study, out, pil=None):
     document = json.loads((out / "comparison.json").read_text())
     jsonschema.validate(document, schema("comparison"))
     (table,) = tables_of((out / "comparison.html").read_text())["Comparison"]
+    worst = max(x["residual_rms"] or 0.0 for x in document["variants"])
+    assert document["uncontrolled_residual_rms"] > worst
     return document["variants"], table
 
 
@@ -88,7 +90,13 @@ def test_the_cheapest_of_those_as_good_is_recommended():
         variant(20e3, 32, 2.5, 0.99e-7, 1.10),  # takes too long
     ]
     found = ComparedVariants(
-        out=None, study=None, motion="", board=None, dac_bits=12, variants=tuple(made)
+        out=None,
+        study=None,
+        motion="",
+        board=None,
+        dac_bits=12,
+        variants=tuple(made),
+        uncontrolled=1e-5,
     )
     assert cheapest(found) is made[3]
     assert cheapest(found._replace(variants=tuple(made[:1]))) is None

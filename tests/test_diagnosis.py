@@ -11,7 +11,20 @@ from studies.fitting.estimate import fit
 from studies.fitting.problem import Problem
 from studies.fitting.report import sentences
 from studies.fitting.solve import descend
-from tests.fits import FREE, FREQUENCY, RESPONSE, blank, made, spec_of, write
+from tests.fits import (
+    FREE,
+    FREQUENCY,
+    MAGNITUDE,
+    MODES,
+    RESPONSE,
+    SPECTRUM,
+    TRACE,
+    blank,
+    give_data,
+    made,
+    spec_of,
+    write,
+)
 
 SIGNALS = [
     ("actuator 1.1", "sensor 1.2"),
@@ -95,10 +108,10 @@ FAULTS = {
     "delay": (only(1, lambda x: late(x, 4e-4)), r"response 2: it is late by ([\d.]+) ms$", 0.4),
     "all delayed": (
         lambda _, x: late(x, -2.5e-4),
-        r"every response: it is early by ([\d.]+) ms$",
+        r"every measurement: it is early by ([\d.]+) ms$",
         0.25,
     ),
-    "rad/s": (lambda _, x: in_radians(x), "every response: its frequencies are in rad/s", None),
+    "rad/s": (lambda _, x: in_radians(x), "every measurement: its frequencies are in rad/s", None),
 }
 
 
@@ -125,6 +138,55 @@ def test_exchanged_channels_are_named(measured):
 
     best = diagnosed(measured, swapped)[0]
     assert best.text == "response 2: its sensor is 2.2"
+
+
+def moved(one, delay):
+    one.time = one.time + delay
+    return one
+
+
+def of_another_sensor(one):
+    other = copy.copy(one)
+    other.signal = one.signal._replace(link=2)
+    one.measured = one.measured + other.predict(TRUE, False)[0] - one.predict(TRUE, False)[0]
+    return one
+
+
+MOVED = TRACE | {"sigma": 0.05}
+BENDING = SPECTRUM | {"input": "actuator 1.1", "output": "sensor 1.2"}
+#: Kind, what is done to it, and what is said of it; beside a sound response.
+OTHER_KINDS = [
+    (MAGNITUDE, lambda x: scaled(x, 1e3), r"other: it is too large by a factor of 1000"),
+    (MAGNITUDE, lambda x: scaled(x, 1.7), r"other: its gain is wrong by a factor of 1\.7"),
+    (MAGNITUDE, in_radians, "other: its frequencies are in rad/s"),
+    (BENDING, in_radians, "other: its frequencies are in rad/s"),
+    (MODES, lambda x: x.stretched(2 * np.pi), "other: its frequencies are in rad/s"),
+    (MOVED, lambda x: scaled(x, -1.0), "other: its polarity is reversed"),
+    (MOVED, lambda x: scaled(x, 9.80665), "other: it is too large by a factor of 9.81"),
+    (MOVED, lambda x: moved(x, 3e-4), r"other: it is late by 0\.(29|30|31)\d* ms"),
+    (MOVED, of_another_sensor, r"other: its sensor is 3\.2"),
+]
+
+
+@pytest.fixture(scope="module")
+def kinds(folder):
+    """By kind of the other entry: specification, bench and measurements of the true machine."""
+    return {}
+
+
+@pytest.mark.parametrize("entry, spoil, said", OTHER_KINDS)
+def test_faults_of_other_kinds_are_named(folder, kinds, entry, spoil, said):
+    if entry["kind"] not in kinds:
+        sound = RESPONSE | {"sigma_percent": 0.3, "sigma": 1e-6}
+        pair = [sound, entry | {"name": "other"}]
+        spec = spec_of(folder, *pair)
+        bench, every, _ = made(spec)
+        rng = np.random.default_rng(0)
+        for one in every:
+            give_data(bench, one, TRUE, rng)
+        kinds[entry["kind"]] = spec, bench, every
+    best = diagnosed(kinds[entry["kind"]], only(1, spoil))[0]
+    assert re.match(said, best.text), best.text
 
 
 def test_good_data_have_no_remedy(measured):

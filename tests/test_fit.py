@@ -50,6 +50,7 @@ from tests.fits import (
     TRACE,
     blank,
     made,
+    measured_modes,
     spec_of,
     write,
 )
@@ -63,19 +64,6 @@ def folder(tmp_path_factory):
     found = tmp_path_factory.mktemp("data")
     blank(found)
     return found
-
-
-def measured_modes(bench, one, values):
-    """The model's own modes as if they were measured."""
-    plant = bench.plant(one._pose, values, False)
-    modes = plant.modes
-    frequency = np.abs(modes.pole) / TWO_PI
-    bending = np.flatnonzero(frequency > 60)[: len(one._modes.frequency)]
-    return one._modes._replace(
-        frequency=frequency[bending],
-        damping=(-modes.pole.real / np.abs(modes.pole))[bending],
-        shapes=(np.asarray(plant.value.sensor) @ modes.shape[:, bending]).T,
-    )
 
 
 def fourth_order(f, x, step):

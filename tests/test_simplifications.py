@@ -46,7 +46,9 @@ def test_patches_left_out_are_named_with_their_effect():
 
 
 def test_controller_of_another_plant_is_a_mismatch():
-    with pytest.warns(ModelWarning, match="104.4 Hz, the plant at 94.11 Hz; see control.basis"):
+    with pytest.warns(
+        ModelWarning, match="104.4 Hz, the plant at 94.11 Hz; see control.basis .a nearer"
+    ):
         check_run(study(basis="loaded", **CARBON))
     with pytest.warns(ModelWarning, match="at 80 Hz, .*; see control.frequencies_hz"):
         check_run(study({"frequencies_hz": [80.0], "modes": 1}))

@@ -10,7 +10,13 @@ from studies.space.spec import parse_sweep
 from studies.space.table import build_table
 from studies.study.cases import build_case, build_cases, build_structure
 from studies.study.spec import Study, parse_study
-from studies.study.window import SETTLED, residual_delay, settling_time, with_window
+from studies.study.window import (
+    SETTLED,
+    residual_delay,
+    settling_time,
+    with_own_window,
+    with_window,
+)
 from studies.tuning.spec import parse_tuning
 
 STRUCK = {"pulse_force": [20.0, -10.0, 5.0], "pulse_start": 0.002, "pulse_length": 0.002}
@@ -129,3 +135,12 @@ def test_one_window_must_suit_the_disturbances_of_all_cases(drive, axis):
     build_table(parse_sweep(data | {"metrics": {"residual_delay": 0.3}}))
     harmless = {"drive.pulse_force": [[10.0, 0.0, 0.0], [20.0, 0.0, 0.0]], "drive.kp": [1e4, 2e4]}
     build_table(parse_sweep({"drive": STRUCK, "sweep": {"axes": harmless}}))
+
+
+def test_a_machine_that_was_found_has_its_own_window():
+    """What a fit starts from settles at another time than what it finds."""
+    found = with_window(Study()).change(drive__kd=90.0)
+    own = residual_delay(Study().change(drive__kd=90.0))
+    assert residual_delay(found) != own == residual_delay(with_own_window(found, {}))
+    given = {"metrics": {"residual_delay": 0.02}}
+    assert with_own_window(found, given) == found

@@ -66,7 +66,10 @@ def warn_of_mismatch(study: Study, plant_omega: np.ndarray, model_omega: np.ndar
     if error.size == 0 or error.max() <= MISMATCH_LIMIT:
         return
     cause = "control.frequencies_hz" if study.control.frequencies_hz else "control.basis"
-    warn_of_model(f"{mismatch_text(nominal, model_omega, error)}; see {cause}")
+    warn_of_model(
+        f"{mismatch_text(nominal, model_omega, error)}; see {cause} (a nearer model may need other "
+        "gains: compare gain margins)"
+    )
 
 
 def mismatch_text(plant_omega: np.ndarray, model_omega: np.ndarray, error: np.ndarray) -> str:

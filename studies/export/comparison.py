@@ -78,6 +78,7 @@ class ComparedVariants(NamedTuple):
     board: Board | None
     dac_bits: int
     variants: tuple[Variant, ...]
+    uncontrolled: float  # residual vibration without control, as `Variant.residual` [m]
 
     @property
     def is_good(self) -> bool:
@@ -121,6 +122,8 @@ def compare_variants(
     motion = find_motion(design.study)
     if motion.text:
         console.print(motion.text, soft_wrap=True)
+    uncontrolled = _uncontrolled(motion.study)
+    console.print(f"without control: residual vibration {1e6 * uncontrolled:.3g} µm")
     variants: list[Variant] = []
     for rate in RATES:
         for variant in _at_rate(motion.study, rate, bits, board, compiler):
@@ -133,12 +136,19 @@ def compare_variants(
         board=board,
         dac_bits=bits,
         variants=tuple(variants),
+        uncontrolled=uncontrolled,
     )
     with publish(out) as staging:
         (staging / PAGE).write_text(_page(found), encoding="utf-8")
         (staging / DOCUMENT).write_text(_document(found), encoding="utf-8")
     announce(console, out / PAGE)
     return found
+
+
+def _uncontrolled(study: Study) -> float:
+    """Residual vibration where actuators stay at rest [m]."""
+    own = fixed_controller(study)
+    return _residual(run_in_the_loop(own.structure, own.case, np.zeros_like))
 
 
 def _at_rate(
@@ -318,6 +328,7 @@ def _document(found: ComparedVariants) -> str:
         "motion": found.motion,
         "processor": "" if found.board is None else found.board.name,
         "dac_bits": found.dac_bits,
+        "uncontrolled_residual_rms": found.uncontrolled,
         "variants": [_described(x) for x in found.variants],
     }
     return json_text("comparison", whole)

@@ -1,22 +1,20 @@
-"""What would mend a misfit: a fault of one or all measured responses, or a field that is fixed.
+"""What would mend a misfit: a fault of one or all measurements, or a field that is fixed.
 
-Faults that are made when data are taken (polarity, unit, delay, a cable in the wrong socket) are
-tried one by one at each response, where the fit ended and where it began; the best of them is
-accepted only if a new fit with it is far better. Fixed fields are rated by the score test (Rao
-1948), chi square's fall by its slopes, and the best of them freed.
+Faults that are made when data are taken (`faults`: polarity, unit, delay, a cable in the wrong
+socket) are tried one by one at each measurement, where the fit ended and where it began; the best
+of them is accepted only if a new fit with it is far better. Fixed fields are rated by the score
+test (Rao 1948), chi square's fall by its slopes, and the best of them freed.
 """
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from studies.errors import StudyError
+from studies.fitting.faults import Fault, fault_of
 from studies.fitting.kinds.contract import Measurement
-from studies.fitting.kinds.response import ComplexResponse
 from studies.fitting.measurements import make_bench, make_measurements
 from studies.fitting.problem import Problem, make_problem
 from studies.fitting.solve import descend_all, follow
@@ -25,27 +23,14 @@ from studies.fitting.statistics import misfit
 from studies.space.free import plain_numbers
 from studies.study.margin import MARGIN_MODES
 from studies.study.paths import free_fields, known_field, parts_of
-from studies.study.signals import Signal
 from studies.study.spec import DESIGN, MACHINE
 
 #: A remedy is told if it lowers chi square by this factor [1].
 BETTER = 3.0
-#: One fault of a response is as good as a more complicated one within this factor [1].
-AS_GOOD = 1.3
-#: Delays tried [s], and gains with a meaning of their own.
-DELAYS = np.concatenate([-np.geomspace(1e-2, 2e-5, 60), np.geomspace(2e-5, 1e-2, 60)])
-GAINS = {
-    2 * np.pi: "2 pi",
-    1 / (2 * np.pi): "1/(2 pi)",
-    9.80665: "9.81, as of accelerations in g",
-    1e3: "1000",
-    1e-3: "1/1000",
-    2.0: "2",
-    0.5: "1/2",
-    np.sqrt(2): "the root of 2, as of peak and rms values",
-}
 #: Faults of one kind are one where their sizes differ by no more than this [1].
 ALIKE = 0.1
+#: Times that faults are sized anew.
+RESIZED = 3
 #: Evaluations of a new fit; fixed fields that are freed, the best first.
 ITERATIONS, FREED = 25, 3
 #: Sections of the study with fields of the machine.
@@ -60,14 +45,6 @@ class Remedy(NamedTuple):
     text: str
     before: float  # chi square
     after: float  # of a fit with it
-
-
-class _Fault(NamedTuple):
-    """A fault of a response, undone."""
-
-    text: str  # with a place for its size, if it has one
-    mend: Callable[[ComplexResponse], ComplexResponse]
-    size: float = 0.0
 
 
 def diagnose(spec: FitSpec, problem: Problem, u: np.ndarray) -> tuple[Remedy, ...]:
@@ -91,40 +68,41 @@ def _square(problem: Problem, u: np.ndarray) -> float:
 
 
 def _of_data(problem: Problem, u: np.ndarray) -> list[Remedy]:
-    """Faults of responses, all undone together."""
+    """Faults of measurements, all undone together.
+
+    They are sized once more where the best fit without them ended.
+    """
     start, before = problem.free.places(), _square(problem, u)
     best: Remedy | None = None
-    for at in (u, start):
+    places = [u, start]
+    for at in places:
         values = problem.free.values(at)
-        mended, faults = list[Measurement](), list[tuple[str, _Fault]]()
+        mended, faults = list[Measurement](), list[tuple[str, Fault]]()
         for one in problem.measurements:
-            fault = None
-            if isinstance(one, ComplexResponse) and not _is_noise(one, values):
-                fault = _fault_of(one, values)
-            if fault is None:
-                mended.append(one)
-            else:
-                assert isinstance(one, ComplexResponse)
-                mended.append(fault.mend(one))
+            fault = None if _is_noise(one, values) else fault_of(one, values, BETTER)
+            mended.append(one if fault is None else fault.mended)
+            if fault is not None:
                 faults.append((one.name, fault))
         if not faults:
             continue
         other = problem._replace(measurements=tuple(mended))
-        optima = descend_all(other, [at, start], ITERATIONS)
-        after = min((2 * x.cost for x in optima), default=np.inf)
-        if best is None or after < best.after:
-            every = sum(isinstance(x, ComplexResponse) for x in problem.measurements)
-            best = Remedy(_fault_words(faults, every), before, after)
+        optimum = min(
+            descend_all(other, [at, start], ITERATIONS), key=lambda x: x.cost, default=None
+        )
+        if optimum is not None and (best is None or 2 * optimum.cost < best.after):
+            best = Remedy(_fault_words(faults, len(mended)), before, 2 * optimum.cost)
+            if len(places) <= RESIZED:
+                places.append(optimum.u)
     return [] if best is None else [best]
 
 
-def _is_noise(one: ComplexResponse, values: np.ndarray) -> bool:
+def _is_noise(one: Measurement, values: np.ndarray) -> bool:
     return bool(misfit(one, one.residual(values, False)).is_noise)
 
 
-def _fault_words(faults: list[tuple[str, _Fault]], every: int) -> str:
+def _fault_words(faults: list[tuple[str, Fault]], every: int) -> str:
     """Faults of one kind and nearly one size are one fault."""
-    groups: list[list[tuple[str, _Fault]]] = []
+    groups: list[list[tuple[str, Fault]]] = []
     for name, fault in faults:
         for group in groups:
             other = group[0][1]
@@ -138,112 +116,9 @@ def _fault_words(faults: list[tuple[str, _Fault]], every: int) -> str:
     for group in groups:
         size = float(np.median([fault.size for _, fault in group]))
         names = ", ".join(name for name, _ in group)
-        which = "every response" if len(group) == every > 1 else names
+        which = "every measurement" if len(group) == every > 1 else names
         parts.append(f"{which}: {group[0][1].text.format(size)}")
     return "; ".join(parts)
-
-
-def _fault_of(one: ComplexResponse, values: np.ndarray) -> _Fault | None:
-    """The simplest fault that, undone, brings a response near the model; None if none does."""
-    rated = []
-    for fault in _faults(one, values):
-        try:
-            mended = fault.mend(one)
-            square = float(np.sum(mended.residual(values, False).value ** 2))
-        except (StudyError, np.linalg.LinAlgError):
-            continue
-        rated.append((square, fault))
-    if not rated:
-        return None
-    own = float(np.sum(one.residual(values, False).value ** 2))
-    least = min(square for square, _ in rated)
-    if least * BETTER > own:
-        return None
-    return next(fault for square, fault in rated if square <= AS_GOOD * least)
-
-
-def _faults(one: ComplexResponse, values: np.ndarray) -> Iterator[_Fault]:
-    """Simple faults first, those with a number of their own last."""
-    yield _Fault("its polarity is reversed", _times(-1.0))
-    yield _Fault("it is conjugated, as with exp(-j omega t)", _conjugated)
-    yield _Fault("its frequencies are in rad/s", _stretched(1 / (2 * np.pi)))
-    for gain, name in GAINS.items():
-        yield _Fault(f"it is too large by a factor of {name}", _times(1 / gain))
-    yield from _other_channels(one)
-    model, _ = one.predict(values, False)
-    weight = 1 / one.sigma**2
-    delay = _best_delay(one, model, weight)
-    text = f"it is {'late' if delay > 0 else 'early'} by {{:.3g}} ms"
-    yield _Fault(text, _shifted(delay), 1e3 * abs(delay))
-    gain = np.sum(weight * one.measured.conj() * model) / np.sum(weight * np.abs(one.measured) ** 2)
-    size = abs(gain)
-    if size > 0:
-        yield _Fault("its gain is wrong by a factor of {:.4g}", _times(float(size)), 1 / size)
-        angle = np.degrees(np.angle(gain))
-        text = f"its gain is wrong by a factor of {1 / size:.4g} and {-angle:.3g} deg"
-        yield _Fault(text, _times(complex(gain)))
-
-
-def _best_delay(one: ComplexResponse, model: np.ndarray, weight: np.ndarray) -> float:
-    """By which the response lags behind the model [s]."""
-    turn = np.exp(2j * np.pi * np.multiply.outer(DELAYS, one.frequency))
-    fit = np.sum(weight * np.abs(one.measured * turn - model) ** 2, axis=1)
-    k = int(np.argmin(fit))
-    near = np.linspace(DELAYS[max(k - 1, 0)], DELAYS[min(k + 1, len(DELAYS) - 1)], 201)
-    turn = np.exp(2j * np.pi * np.multiply.outer(near, one.frequency))
-    fit = np.sum(weight * np.abs(one.measured * turn - model) ** 2, axis=1)
-    return float(near[int(np.argmin(fit))])
-
-
-def _changed(one: ComplexResponse, measured: np.ndarray, scale: float = 1.0) -> ComplexResponse:
-    other = copy.copy(one)
-    other.measured, other.sigma = measured, scale * one.sigma
-    return other
-
-
-def _times(gain: complex) -> Callable[[ComplexResponse], ComplexResponse]:
-    return lambda one: _changed(one, gain * one.measured, abs(gain))
-
-
-def _conjugated(one: ComplexResponse) -> ComplexResponse:
-    return _changed(one, one.measured.conj())
-
-
-def _shifted(delay: float) -> Callable[[ComplexResponse], ComplexResponse]:
-    return lambda one: _changed(one, one.measured * np.exp(2j * np.pi * one.frequency * delay))
-
-
-def _stretched(factor: float) -> Callable[[ComplexResponse], ComplexResponse]:
-    def mend(one: ComplexResponse) -> ComplexResponse:
-        other = copy.copy(one)
-        other.frequency = factor * one.frequency
-        return other
-
-    return mend
-
-
-def _other_channels(one: ComplexResponse) -> Iterator[_Fault]:
-    """Another sensor or actuator in place of the one that the file names."""
-    for place, what in ((1, "sensor"), (0, "actuator")):
-        own = one.signals[place]
-        if own.kind != what:
-            continue
-        for link in range(3):
-            for patch in range(one.n_patches):
-                if (link, patch) != (own.link, own.patch):
-                    text = f"its {what} is {link + 1}.{patch + 1}"
-                    yield _Fault(text, _with_signal(place, own._replace(link=link, patch=patch)))
-
-
-def _with_signal(place: int, signal: Signal) -> Callable[[ComplexResponse], ComplexResponse]:
-    def mend(one: ComplexResponse) -> ComplexResponse:
-        other = copy.copy(one)
-        signals = list(one.signals)
-        signals[place] = signal
-        other.signals = (signals[0], signals[1])
-        return other
-
-    return mend
 
 
 # --- fixed fields ---------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from studies.fitting.statistics import Answer, Misfit, misfit, rivals
 from studies.publish import shown
 from studies.study.paths import set_values
 from studies.study.spec import Study, parse_study
+from studies.study.window import with_own_window
 from studies.threads import serial_blas
 
 #: Parameters up to which all likelihoods are profiled.
@@ -116,7 +117,8 @@ def estimate(spec: FitSpec, phases: Phases | None = None) -> Fitted:
         posterior = sample(problem, shape(answer), fit.samples, fit.seed)
     phases.begin("check")
     checks, unpredicted = _predictable([x for x in every if x.is_checked], answer.values)
-    study = parse_study(set_values(spec.study, named_values(spec, answer.values)))
+    fitted = parse_study(set_values(spec.study, named_values(spec, answer.values)))
+    study = with_own_window(fitted, spec.data)
     return Fitted(
         spec=spec,
         problem=problem,

@@ -82,6 +82,21 @@ def with_window(study: Study) -> Study:
     return study.change(metrics__residual_delay=delay)
 
 
+def with_own_window(study: Study, data: Mapping[str, Any]) -> Study:
+    """A study that came of `with_window` with its own window: that of another drive is another.
+
+    Args:
+        study: what became of it.
+        data: sections of the file, as written.
+    """
+    return study.change(metrics__residual_delay=AUTO) if _is_open(data) else study
+
+
+def _is_open(data: Mapping[str, Any]) -> bool:
+    """Whether a file leaves the window open."""
+    return bool(data.get("metrics", {}).get("residual_delay", AUTO) == AUTO)
+
+
 def never_settles(study: Study) -> StudyError:
     """What to say where the residual window would have to wait for ever."""
     drive, wait = study.drive, settling_time(study)
@@ -110,8 +125,7 @@ def check_varied(data: Mapping[str, Any], study: Study, names: Iterable[str]) ->
     Raises:
         StudyError: "auto" while the motion moves against a disturbance, or the other way round.
     """
-    metrics = data.get("metrics", {})
-    if metrics.get("residual_delay", AUTO) != AUTO:
+    if not _is_open(data):
         return
     fields = {name.partition("[")[0] for name in names}
     has_pulse = bool(_disturbance_ends(study))

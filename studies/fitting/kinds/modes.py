@@ -6,8 +6,9 @@ model's modes near one frequency (subspace MAC), so that three nearly equal mode
 
 from __future__ import annotations
 
+import copy
 from abc import abstractmethod
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import scipy
@@ -84,6 +85,12 @@ class _Modes(Measurement):
             *(f"mode {k + 1} [Hz]" for k in range(len(modes.frequency))),
             *(f"damping {k + 1} [1]" for k in self._damped),
         )
+
+    def stretched(self, factor: float) -> Self:
+        """The same with other frequencies."""
+        other, own = copy.copy(self), self._modes
+        other.use(own._replace(frequency=factor * own.frequency, sigma=factor * own.sigma))
+        return other
 
     @abstractmethod
     def model_modes(self, values: np.ndarray, has_slopes: bool) -> ModelModes:

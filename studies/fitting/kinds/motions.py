@@ -65,6 +65,11 @@ class Motion:
         self._kinds: set[str] = set()
         self._kept: tuple[Any, Any] = None, None
 
+    @property
+    def n_patches(self) -> int:
+        """Pairs of patches on each link."""
+        return self._structure.n_patches
+
     def add(self, signal: Signal) -> None:
         """Record what this output needs, too."""
         self._kinds.add(signal.kind)

@@ -48,16 +48,21 @@ class Trace(Measurement):
         """
         super().__init__(name, is_checked, measured, noise.sigma(measured))
         self.unknown, self.n_hidden = unknown, len(unknown)
-        self._motion, self._signal, self._noise, self._unit = motion, signal, noise, unit
+        self._motion, self.signal, self._noise, self._unit = motion, signal, noise, unit
         self.time = time
         motion.add(signal)
+
+    @property
+    def n_patches(self) -> int:
+        """Pairs of patches on each link."""
+        return self._motion.n_patches
 
     def predict(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
         model, slope, _ = self._adjusted(values, has_slopes)
         return model, slope
 
     def _adjusted(self, values: np.ndarray, has_slopes: bool) -> Adjusted:
-        run = self._motion.find(self.name, self._signal, values, has_slopes)
+        run = self._motion.find(self.name, self.signal, values, has_slopes)
         model, slope = np.interp(self.time, run.time, run.value), None
         if run.slope is not None:
             by = [np.interp(self.time, run.time, x) for x in run.slope.T]
@@ -73,7 +78,7 @@ class Trace(Measurement):
     def compare(self, values: np.ndarray) -> Line:
         return Line(
             abscissa="time [s]",
-            ordinate=f"{self._signal.kind} [{self._unit}]",
+            ordinate=f"{self.signal.kind} [{self._unit}]",
             x=self.time,
             measured=self.measured,
             model=self.predict(values, False)[0],
