@@ -59,7 +59,7 @@ def chosen_text(outcome: CommissionFindings) -> str:
     if outcome.is_fast:
         gain += (
             f", tuned on a fast first move without shaper, because the motion of the file leaves "
-            f"less than {LEAST_STEPS:g} ADC steps even without control"
+            f"less than {LEAST_STEPS:g} ADC step under control"
         )
     if outcome.refusals:
         return f"Chosen, but not to be used: {control.law}, {gain}."
