@@ -162,6 +162,7 @@ OTHER_KINDS = [
     (MAGNITUDE, in_radians, "other: its frequencies are in rad/s"),
     (BENDING, in_radians, "other: its frequencies are in rad/s"),
     (MODES, lambda x: x.stretched(2 * np.pi), "other: its frequencies are in rad/s"),
+    (MODES, lambda x: x.stretched(1.0, 100.0), "other: its damping ratios are in percent"),
     (MOVED, lambda x: scaled(x, -1.0), "other: its polarity is reversed"),
     (MOVED, lambda x: scaled(x, 9.80665), "other: it is too large by a factor of 9.81"),
     (MOVED, lambda x: moved(x, 3e-4), r"other: it is late by 0\.(29|30|31)\d* ms"),

@@ -8,6 +8,8 @@ test (Rao 1948), chi square's fall by its slopes, and the best of them freed.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import permutations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,6 +35,8 @@ ALIKE = 0.1
 RESIZED = 3
 #: Evaluations of a new fit; fixed fields that are freed, the best first.
 ITERATIONS, FREED = 25, 3
+#: Stiffness of the links, and by how much it is parted at first, of the way between its bounds [1].
+STIFFNESS, SPREAD = ("link.stiffness_factor", "link.youngs_modulus"), 0.05
 #: Sections of the study with fields of the machine.
 SECTIONS = ("machine", "link", "patches", "load", "drive", "electronics")
 #: Where fields that are zero are searched, by unit.
@@ -55,7 +59,12 @@ def diagnose(spec: FitSpec, problem: Problem, u: np.ndarray) -> tuple[Remedy, ..
         problem: its residuals.
         u: where it ended, (p,).
     """
-    found = [*_of_data(problem, u), *_of_fields(spec, problem, u), *_of_modes(spec, problem, u)]
+    found = [
+        *_of_data(problem, u),
+        *_of_fields(spec, problem, u),
+        *_of_links(spec, problem, u),
+        *_of_modes(spec, problem, u),
+    ]
     found = [x for x in found if x.after * BETTER < x.before]
     return tuple(sorted(found, key=lambda x: x.after))
 
@@ -154,6 +163,41 @@ def _of_fields(spec: FitSpec, problem: Problem, u: np.ndarray) -> list[Remedy]:
         text = f"{name}, which is fixed at {own:.4g}, is {size}"
         found.append(Remedy(text, before, 2 * float(done.cost)))
     return found
+
+
+def _of_links(spec: FitSpec, problem: Problem, u: np.ndarray) -> list[Remedy]:
+    """A free field of the links whose value may differ from link to link."""
+    if problem.has_motions:  # takes minutes
+        return []
+    found = []
+    for field in STIFFNESS:
+        section, _, name = field.partition(".")
+        if field not in spec.fit.free or isinstance(getattr(spec.study.link, name), tuple):
+            continue
+        own = [getattr(spec.study.link, name)] * 3
+        links = dict(spec.data.get(section, {})) | {name: own}
+        try:
+            each = parse_fit(spec.data | {section: links}, spec.folder)
+            bench = make_bench(each)
+        except StudyError:  # the parameters have no place there
+            continue
+        apart = make_problem(each, bench, make_measurements(each, bench))
+        place = dict(zip(problem.free.names, u, strict=True))
+        at = np.array([place.get(x, place.get(x.partition("[")[0])) for x in apart.free.names])
+        starts = [np.clip(at + SPREAD * turn, 1e-9, 1 - 1e-9) for turn in _spreads(apart, field)]
+        after = min((2 * x.cost for x in descend_all(apart, starts, ITERATIONS)), default=np.inf)
+        text = f"the links differ in {field} (a list of three in the study)"
+        found.append(Remedy(text, _square(problem, u), after))
+    return found
+
+
+def _spreads(apart: Problem, field: str) -> Iterator[np.ndarray]:
+    """Directions in which a field's numbers part: every order of the links."""
+    own = [k for k, name in enumerate(apart.free.names) if name.partition("[")[0] == field]
+    for order in permutations((-1.0, 0.0, 1.0)):
+        turn = np.zeros(len(apart.free.names))
+        turn[own] = order
+        yield turn
 
 
 def _of_modes(spec: FitSpec, problem: Problem, u: np.ndarray) -> list[Remedy]:

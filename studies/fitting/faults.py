@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator
+from itertools import combinations
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -71,15 +72,20 @@ def _faults(one: Measurement, values: np.ndarray) -> Iterator[Fault]:
     """Simple faults first, those with a number of their own last."""
     if isinstance(one, HeldModes | MachineModes):
         yield Fault(IN_RADIANS, one.stretched(1 / TWO_PI))
+        yield Fault("its damping ratios are in percent", one.stretched(1.0, 1 / 100))
+    if isinstance(one, MachineModes):
+        for j, k in combinations(range(one.n_channels), 2):
+            names = " and ".join(one.channel(x) for x in (j, k))
+            yield Fault(f"{names} are exchanged", one.exchanged(j, k))
     if isinstance(one, Spectrum):  # of any strength
-        yield Fault(IN_RADIANS, _stretched(one))
-        yield from _other_channels(one)
+        yield Fault(IN_RADIANS, _stretched(one, values))
+        yield from _other_channels(one, values)
     if isinstance(one, ComplexResponse):
         yield from _of_response(one, values)
     if isinstance(one, Magnitude):
-        yield Fault(IN_RADIANS, _stretched(one))
+        yield Fault(IN_RADIANS, _stretched(one, values))
         yield from _named_gains(one)
-        yield from _other_channels(one)
+        yield from _other_channels(one, values)
         yield from _gain(one, np.abs(one.predict(values, False)[0]))
     if isinstance(one, Trace):
         yield from _of_trace(one, values)
@@ -90,9 +96,9 @@ def _of_response(one: ComplexResponse, values: np.ndarray) -> Iterator[Fault]:
     yield Fault(
         "it is conjugated, as with exp(-j omega t)", _with(one, measured=one.measured.conj())
     )
-    yield Fault(IN_RADIANS, _stretched(one))
+    yield Fault(IN_RADIANS, _stretched(one, values))
     yield from _named_gains(one)
-    yield from _other_channels(one)
+    yield from _other_channels(one, values)
     model, _ = one.predict(values, False)
     weight = 1 / one.sigma**2
 
@@ -113,7 +119,7 @@ def _of_trace(one: Trace, values: np.ndarray) -> Iterator[Fault]:
     yield Fault("its polarity is reversed", _times(one, -1.0))
     yield from _named_gains(one)
     for text, signal in _others(one.signal, "sensor", one.n_patches):
-        yield Fault(text, _with(one, signal=signal))
+        yield Fault(text, _weighed(one, values, signal=signal))
 
     def shifted(delay: float) -> Trace:
         return _with(one, time=one.time - delay)
@@ -153,6 +159,13 @@ def _best_gain(one: Measurement, model: np.ndarray) -> complex:
     return complex(np.sum(weight * one.measured.conj() * model) / max(power, 1e-300))
 
 
+def _weighed(one: T, values: np.ndarray, **changes: object) -> T:
+    """A measurement with another model, whose noise is a share of that."""
+    other = _with(one, **changes)
+    other.reweigh(values)
+    return other
+
+
 def _with(one: T, **changes: object) -> T:
     """A measurement with other data."""
     other = copy.copy(one)
@@ -166,17 +179,19 @@ def _times(one: T, gain: complex) -> T:
     return _with(one, measured=factor * one.measured, sigma=abs(factor) * one.sigma)
 
 
-def _stretched(one: F) -> F:
-    return _with(one, frequency=one.frequency / TWO_PI)
+def _stretched(one: F, values: np.ndarray) -> F:
+    return _weighed(one, values, frequency=one.frequency / TWO_PI)
 
 
-def _other_channels(one: ComplexResponse | Magnitude | Spectrum) -> Iterator[Fault]:
+def _other_channels(
+    one: ComplexResponse | Magnitude | Spectrum, values: np.ndarray
+) -> Iterator[Fault]:
     """Another sensor or actuator in place of the one that the file names."""
     source, output = one.signals
     for text, signal in _others(output, "sensor", one.n_patches):
-        yield Fault(text, _with(one, signals=(source, signal)))
+        yield Fault(text, _weighed(one, values, signals=(source, signal)))
     for text, signal in _others(source, "actuator", one.n_patches):
-        yield Fault(text, _with(one, signals=(signal, output)))
+        yield Fault(text, _weighed(one, values, signals=(signal, output)))
 
 
 def _others(own: Signal, kind: str, n_patches: int) -> Iterator[tuple[str, Signal]]:

@@ -164,8 +164,8 @@ def _remedies(fitted: Fitted) -> list[str]:
     """What would mend a misfit."""
     if fitted.is_diagnosed and not fitted.remedies:
         return [
-            "Nothing that was tried would mend it: the usual faults of complex responses, fields "
-            "of the machine that are fixed here, more modes."
+            "Nothing that was tried would mend it: the usual faults of measurements, fields of the "
+            "machine that are fixed here, links that differ, more modes."
         ]
     return [
         f"Chi square would be {one.after:.4g} in place of {one.before:.4g} if this is so: "

@@ -177,7 +177,7 @@ class DecayEntry(FileEntry, PoseEntry):
         0.0, "Hz", "highest one; 0: 0.4 times the sample rate of the record", ge=0, le=1e5
     )
     sigma_percent: Percent = described(
-        0.05, "%", "standard deviation of a pole over its size, beside what the scatter says"
+        1e-3, "%", "standard deviation of a pole over its size, beside what the scatter says"
     )
 
 

@@ -107,6 +107,8 @@ def make_decay(spec: FitSpec, models: Models, entry: DecayEntry, path: str) -> M
         raise field_error(f"{path}.values", columns, f"{len(signals)} columns, one of each output")
     if len(set(signals)) < len(signals):
         raise field_error(f"{path}.outputs", entry.outputs, "each output once")
+    if len({*columns, entry.time}) <= len(columns):
+        raise field_error(f"{path}.values", columns, "each column once, without that of the time")
     is_own = [x.kind in GIVEN for x in signals]
     if "quantity" in entry.model_fields_set and all(is_own):
         raise StudyError(f"{path}.quantity: has no meaning for {entry.outputs[0]!r}; leave it out")

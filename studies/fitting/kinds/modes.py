@@ -17,7 +17,7 @@ from studies.errors import StudyError, field_error
 from studies.fitting.bench import Bench, Modes, PlantAt, Pose
 from studies.fitting.decays import Diagram
 from studies.fitting.kinds.contract import Measurement, Numbers
-from studies.study.signals import Signal
+from studies.study.signals import Signal, signal_name
 
 #: Modes closer than this share one subspace [1].
 NEAR = 0.03
@@ -86,10 +86,15 @@ class _Modes(Measurement):
             *(f"damping {k + 1} [1]" for k in self._damped),
         )
 
-    def stretched(self, factor: float) -> Self:
-        """The same with other frequencies."""
+    def stretched(self, factor: float, damping: float = 1.0) -> Self:
+        """The same with frequencies and damping ratios times a factor each."""
         other, own = copy.copy(self), self._modes
-        other.use(own._replace(frequency=factor * own.frequency, sigma=factor * own.sigma))
+        own = own._replace(frequency=factor * own.frequency, sigma=factor * own.sigma)
+        if own.damping is not None and own.damping_sigma is not None:
+            own = own._replace(
+                damping=damping * own.damping, damping_sigma=damping * own.damping_sigma
+            )
+        other.use(own)
         return other
 
     @abstractmethod
@@ -185,6 +190,27 @@ class MachineModes(_Modes):
         """
         super().__init__(name, is_checked, bench, modes)
         self._pose, self._seen, self.diagram = pose, seen, diagram
+
+    @property
+    def n_channels(self) -> int:
+        """Numbers in a shape, 0 without shapes."""
+        return 0 if self._modes.shapes is None else self._modes.shapes.shape[1]
+
+    def channel(self, k: int) -> str:
+        """What a number of a shape was measured by."""
+        if self._seen is not None:
+            return signal_name(self._seen.signals[k])
+        link, patch = divmod(k, self._bench.n_patches)
+        return signal_name(Signal("sensor", link, patch, np.nan))
+
+    def exchanged(self, j: int, k: int) -> Self:
+        """The same with two numbers of every shape exchanged."""
+        other, own = copy.copy(self), self._modes
+        assert own.shapes is not None
+        order = np.arange(self.n_channels)
+        order[[j, k]] = k, j
+        other.use(own._replace(shapes=own.shapes[:, order]))
+        return other
 
     def model_modes(self, values: np.ndarray, has_slopes: bool) -> ModelModes:
         plant = self._bench.plant(self._pose, values, has_slopes)
