@@ -26,7 +26,7 @@ from studies.errors import StudyError, field_error
 from studies.fitting.realisation import (
     SAME_FREQUENCY,
     TWO_PI,
-    Poles,
+    RingingPoles,
     find_modes,
     find_orders,
     refined,
@@ -244,7 +244,7 @@ def _check_rest(rest: np.ndarray, step: float, path: str) -> None:
 
 
 def _jackknifed(
-    blocks: np.ndarray, modes: Poles, step: float, band: tuple[float, float], path: str
+    blocks: np.ndarray, modes: RingingPoles, step: float, band: tuple[float, float], path: str
 ) -> tuple[np.ndarray, np.ndarray]:
     """The same of ambient records, by the scatter without one block each."""
     whole, count = blocks.sum(axis=0), len(blocks)

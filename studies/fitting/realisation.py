@@ -15,7 +15,7 @@ ORDERS = range(2, 62, 2)
 #: Poles are the same where frequency [1] and damping ratio [1] differ by less, and shapes are
 #: as much alike (MAC) [1]; refinement moves them by up to so many times as much.
 SAME_FREQUENCY, SAME_DAMPING, SAME_SHAPE, MOVED = 0.005, 0.003, 0.95, 4.0
-#: Poles of less and of more damping are no modes [1].
+#: RingingPoles of less and of more damping are no modes [1].
 LEAST_DAMPED, MOST_DAMPED = 1e-6, 0.2
 #: Singular values below this share of the largest are rounding [1].
 EXACT = 1e-9
@@ -26,18 +26,18 @@ FEWEST_LINES = 1.5
 TWO_PI = 2 * np.pi
 
 
-class Poles(NamedTuple):
+class RingingPoles(NamedTuple):
     """Oscillating poles."""
 
     size: np.ndarray  # [1/s], (m,)
     damping: np.ndarray  # [1], (m,)
     shape: np.ndarray  # of size 1, (m, c)
 
-    def at(self, index: np.ndarray) -> Poles:
+    def at(self, index: np.ndarray) -> RingingPoles:
         """Some of them."""
-        return Poles(self.size[index], self.damping[index], self.shape[index])
+        return RingingPoles(self.size[index], self.damping[index], self.shape[index])
 
-    def distance(self, other: Poles) -> np.ndarray:
+    def distance(self, other: RingingPoles) -> np.ndarray:
         """How far they are from others; up to 1 they are the same, (m, others)."""
         mac = np.abs(self.shape.conj() @ other.shape.T) ** 2
         return np.maximum.reduce(
@@ -70,10 +70,10 @@ def _transition(seen: np.ndarray, c: int) -> np.ndarray:
     return np.asarray(np.linalg.lstsq(seen[:-c], seen[c:], rcond=None)[0])
 
 
-def find_orders(signals: np.ndarray, step: float, band: tuple[float, float]) -> list[Poles]:
-    """Poles within the band, order by order."""
+def find_orders(signals: np.ndarray, step: float, band: tuple[float, float]) -> list[RingingPoles]:
+    """RingingPoles within the band, order by order."""
     seen, c = _observability(signals)
-    found: list[Poles] = []
+    found: list[RingingPoles] = []
     for n in ORDERS:
         if n > seen.shape[1] and found:
             break
@@ -84,14 +84,14 @@ def find_orders(signals: np.ndarray, step: float, band: tuple[float, float]) -> 
         is_mode = (pole.imag > 0) & (damping > LEAST_DAMPED) & (damping < MOST_DAMPED)
         is_mode &= (size >= TWO_PI * band[0]) & (size <= TWO_PI * band[1])
         norm = np.linalg.norm(shape, axis=1, keepdims=True)
-        found.append(Poles(size, damping, shape / np.maximum(norm, 1e-300)).at(is_mode))
+        found.append(RingingPoles(size, damping, shape / np.maximum(norm, 1e-300)).at(is_mode))
     if len(found) < len(ORDERS):  # without noise the last one says it all
         found += [found[-1]] * (len(found) + 1)
     return found
 
 
-def find_modes(orders: list[Poles], often: float) -> tuple[Poles, list[np.ndarray]]:
-    """Poles that come again from order to order, and which of each order do.
+def find_modes(orders: list[RingingPoles], often: float) -> tuple[RingingPoles, list[np.ndarray]]:
+    """RingingPoles that come again from order to order, and which of each order do.
 
     From the highest order down, stable poles are paired with those already found.
     """
@@ -113,12 +113,12 @@ def find_modes(orders: list[Poles], often: float) -> tuple[Poles, list[np.ndarra
     return modes.at(count >= often * len(orders)), is_stable
 
 
-def _joined(one: Poles, other: Poles) -> Poles:
-    return Poles(*(np.concatenate(x) for x in zip(one, other, strict=True)))
+def _joined(one: RingingPoles, other: RingingPoles) -> RingingPoles:
+    return RingingPoles(*(np.concatenate(x) for x in zip(one, other, strict=True)))
 
 
 def refined(
-    signals: np.ndarray, modes: Poles, step: float, band: tuple[float, float], path: str
+    signals: np.ndarray, modes: RingingPoles, step: float, band: tuple[float, float], path: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Most likely sizes and damping ratios of decays, (2, k), their standard deviations, the rest.
 
