@@ -6,7 +6,8 @@ from .dynamics import accelerations, kinetic_energy, potential_energy
 from .kinematics import close_chain, inverse_kinematics
 from .linear import frequency_response, linearise, natural_modes
 from .loop import step
-from .parameters import HOME, Machine, paper_machine
+from .mechanisms.prrr.paper import HOME, paper_machine
+from .parameters import Machine
 from .plant import build_plant
 from .prepare import prepare
 from .sampled_loop import closed_loop

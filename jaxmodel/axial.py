@@ -125,9 +125,11 @@ def lumping_error(
         return jnp.zeros(3)
     chain = close_chain(plant, pose, pose_rate)
     slide = chain.cosine * straight_motion(chain, pose_rate, pose_acc)[0]
+    if chain.turning is not None:
+        slide = slide + chain.sine * chain.turning
     force = (
         left_out[:, :, 0] * slide[:, None]
-        - basis.centrifugal[:, :, 0] * chain.gamma_rate[:, None] ** 2
+        - basis.centrifugal[:, :, 0] * chain.beta_rate[:, None] ** 2
     )
     return jnp.max(jnp.abs(force) / plant.stiffness, axis=1)
 

@@ -23,7 +23,7 @@ class Accelerations(NamedTuple):
     modal: Array  # q'' [m/s2], (3, R)
     coupling: Array  # q'' + (k q + d q')/m: all except the oscillator itself [m/s2], (3, R)
     rho: Array  # rho'' [m/s2], (3,)
-    gamma: Array  # gamma'' [rad/s2], (3,)
+    beta: Array  # beta'' of the links in the plane [rad/s2], (3,)
     axial: Array  # N, tension in the link that acts on its bending [N], (3,)
 
 
@@ -113,7 +113,11 @@ def accelerations(
     mass = plant.modal_mass[:, None]
     spread = _spread(plant, q)
     thrown = q if spread is None else q - spread.turning / mass
-    push = piezo + thrown * (chain.gamma_rate * chain.gamma_rate)[:, None]
+    push = piezo + thrown * (chain.beta_rate * chain.beta_rate)[:, None]
+    if chain.turning is not None:
+        push = push - (plant.b / mass) * (chain.cosine * chain.turning)[:, None]
+        if spread is not None:
+            push = push + (spread.inward / mass) * (chain.sine * chain.turning)[:, None]
     own = (plant.stiffness / mass) * q + (plant.damping / mass) * q_rate
     pull = own - push
     end = None
@@ -138,12 +142,14 @@ def accelerations(
         reaction = end.force[0] + end.force[1] * acc_f + end.force[2] * acc_g
         acc_f = end.motion[1] * acc_f + end.motion[2] * acc_g - end.motion[0]
         coupling = coupling - end.row * (reaction / plant.modal_mass)[:, None]
-    rho_acc, gamma_acc = chain.frame.link_motion(acc_f, acc_g)
+    rho_acc, beta_acc = chain.frame.link_motion(acc_f, acc_g)
     coupling = coupling + (plant.b / mass) * (chain.sine * rho_acc)[:, None]
-    coupling = coupling - (plant.c / mass) * gamma_acc[:, None]
+    coupling = coupling - (plant.c / mass) * beta_acc[:, None]
     # the mass between mid-span and C takes its share of the force at C
     tension = force_f if chain.bend.tip is None else force_g
     axial = tension - plant.tip_mass * chain.cosine * rho_acc
+    if chain.turning is not None:
+        axial = axial - plant.tip_mass * chain.sine * chain.turning
     if not is_coupled and plant.shortening is not None:
         coupling = coupling - shortening_row(plant, q) * (axial / plant.modal_mass)[:, None]
     if spread is not None:
@@ -153,7 +159,7 @@ def accelerations(
         modal=coupling - own,
         coupling=coupling,
         rho=rho_acc,
-        gamma=gamma_acc,
+        beta=beta_acc,
         axial=axial,
     )
 
@@ -175,18 +181,23 @@ class _Swing(NamedTuple):
 def _swing(plant: Plant, chain: Chain, q_rate: Array) -> _Swing:
     """In the link, C is at (c, w) and moves by (-d', w'); velocities alone make its acceleration
 
-    -gamma'^2 (c, w) + 2 gamma' (-w', -d') + (-e2, 0), e2 = sum S_jk q_j' q_k'.
+    -gamma'^2 (c, w) + 2 gamma' (-w', -d') + (-e2, 0), e2 = sum S_jk q_j' q_k', and that of B.
     """
-    rate, bend = chain.gamma_rate, chain.bend
+    rate, bend = chain.beta_rate, chain.bend
     rate2 = rate * rate
     inward, across = chain.chord * rate2, jnp.zeros_like(rate)
     if bend.shortening_rate is not None:
         inward = inward + jnp.sum(shortening_row(plant, q_rate) * q_rate, axis=1)
         across = 2 * rate * bend.shortening_rate
     if bend.tip is None:
-        return _Swing(inward, across, inward, across)
-    outward = inward + 2 * rate * bend.tip_rate
-    return _Swing(-bend.tip * rate2, outward, inward, across)  # f = -n_t, g = t
+        f, g = inward, across
+        to_f, to_g = chain.sine, chain.cosine
+    else:  # f = -n_t, g = t
+        f, g = -bend.tip * rate2, inward + 2 * rate * bend.tip_rate
+        to_f, to_g = -chain.cosine, chain.sine
+    if chain.turning is not None:
+        f, g = f - to_f * chain.turning, g - to_g * chain.turning
+    return _Swing(f, g, inward, across)
 
 
 def _link(
@@ -199,7 +210,7 @@ def _link(
     slider_force: Array,
 ) -> _Link:
     """Slider and link after eliminating q'', except for the effect of the modes on C."""
-    sine, cosine, rate, mass = chain.sine, chain.cosine, chain.gamma_rate, plant.modal_mass
+    sine, cosine, rate, mass = chain.sine, chain.cosine, chain.beta_rate, plant.modal_mass
     bq, bq_rate = jnp.sum(plant.b * q, axis=1), jnp.sum(plant.b * q_rate, axis=1)
     # the centre of mass moves inwards by half the shortening
     across = jnp.sum(plant.b * pull, axis=1) + bq * (rate * rate) + plant.tip_mass * swing.across
@@ -208,12 +219,15 @@ def _link(
         jnp.sum(x * y, axis=1) / mass
         for x, y in ((plant.b, plant.b), (plant.b, plant.c), (plant.c, plant.c))
     )
+    load_g = 2 * rate * (mass * jnp.sum(q * q_rate, axis=1)) - jnp.sum(plant.c * pull, axis=1)
+    if chain.turning is not None:
+        load_g = load_g + (plant.tip_mass * chain.chord * cosine - bq * sine) * chain.turning
     return _Link(
         k_rr=plant.slider_link_mass - sine * sine * bb,
         k_rg=sine * (bc - plant.tip_mass * chain.chord) - cosine * bq,
         k_gg=plant.inertia - cc + mass * jnp.sum(q * q, axis=1),
         load_r=sine * across - cosine * along - slider_force,
-        load_g=2 * rate * (mass * jnp.sum(q * q_rate, axis=1)) - jnp.sum(plant.c * pull, axis=1),
+        load_g=load_g,
     )
 
 
@@ -234,39 +248,45 @@ def _spread_out(
     plant: Plant, chain: Chain, spread: _Spread, link: _Link, q: Array, q_rate: Array, pull: Array
 ) -> _Link:
     """A link with lumped axial inertia, and what distributing it adds."""
-    p, mass, rate = spread.inward, plant.modal_mass, chain.gamma_rate
+    p, mass, rate = spread.inward, plant.modal_mass, chain.beta_rate
     b, c, own, pulled, rates, moment = (
         jnp.sum(p * x, axis=1) for x in (plant.b, plant.c, p, pull, q_rate, -q / 2)
     )
     inward = jnp.sum(_times(plant.inward, q_rate) * q_rate, axis=1)
     along = moment * (rate * rate) + inward - pulled
+    load_g = link.load_g - 2 * rate * jnp.sum(spread.turning * q_rate, axis=1)
+    if chain.turning is not None:
+        load_g = load_g + chain.cosine * moment * chain.turning
     return _Link(
         k_rr=link.k_rr - chain.cosine * (2 * chain.sine * b + chain.cosine * own) / mass,
         k_rg=link.k_rg - chain.sine * moment + chain.cosine * c / mass,
         k_gg=link.k_gg - jnp.sum(spread.turning * q, axis=1),
         load_r=link.load_r + 2 * rate * chain.sine * rates - chain.cosine * along,
-        load_g=link.load_g - 2 * rate * jnp.sum(spread.turning * q_rate, axis=1),
+        load_g=load_g,
     )
 
 
 def _rigid_link(plant: Plant, chain: Chain, swing: _Swing, slider_force: Array) -> _Link:
     """Slider and rigid link."""
+    load_g = jnp.zeros_like(slider_force)
+    if chain.turning is not None:
+        load_g = plant.tip_mass * chain.chord * chain.cosine * chain.turning
     return _Link(
         k_rr=plant.slider_link_mass,
         k_rg=-plant.tip_mass * chain.chord * chain.sine,
         k_gg=plant.inertia,
         load_r=-plant.tip_mass * chain.cosine * swing.inward - slider_force,
-        load_g=jnp.zeros_like(slider_force),
+        load_g=load_g,
     )
 
 
 def _joint(chain: Chain, link: _Link) -> _Joint:
-    """Carry a link to its joint: W = T^t K T, T = rows (rho_f, rho_g), (gamma_f, gamma_g)."""
+    """Carry a link to its joint: W = T^t K T, T = rows (rho_f, rho_g), (beta_f, beta_g)."""
     frame = chain.frame
     # momenta in rho and gamma of a unit motion of C along f, and along g
-    r_f = link.k_rr * frame.rho_f + link.k_rg * frame.gamma_f
-    g_f = link.k_rg * frame.rho_f + link.k_gg * frame.gamma_f
-    r_g, g_g = link.k_rg * frame.gamma_g, link.k_gg * frame.gamma_g
+    r_f = link.k_rr * frame.rho_f + link.k_rg * frame.beta_f
+    g_f = link.k_rg * frame.rho_f + link.k_gg * frame.beta_f
+    r_g, g_g = link.k_rg * frame.beta_g, link.k_gg * frame.beta_g
     if frame.rho_g is not None:
         r_g, g_g = r_g + link.k_rr * frame.rho_g, g_g + link.k_rg * frame.rho_g
     ff, fg = frame.joint_force(r_f, g_f)
@@ -307,13 +327,15 @@ def _release_end(
     scale = 1 / (lead * lead + soft * stiff)
     lead, stiff, soft = lead * scale, stiff * scale, soft * scale
     pulled, fg, load = jnp.sum(row * pull, axis=1), still.fg, still.load_f
+    drag = None if chain.turning is None else mu * chain.sine * chain.turning
+    load = load if drag is None else load - drag
     motion = lead * pulled + soft * load, lead - mu * soft, lead * g_g - soft * fg
     force = lead * load - stiff * pulled, stiff + mu * lead, lead * fg + stiff * g_g
     joint = _Joint(
         ff=mu * motion[1] + force[1],
         fg=mu * motion[2] + force[2],
         gg=still.gg + fg * motion[2] + g_g * force[2],
-        load_f=force[0] - mu * motion[0],
+        load_f=force[0] - mu * motion[0] if drag is None else force[0] - mu * motion[0] + drag,
         load_g=still.load_g - fg * motion[0] + g_g * force[0],
     )
     return _End(row, motion, force), joint
@@ -421,8 +443,11 @@ def straight_motion(chain: Chain, pose_rate: Array, pose_acc: Array) -> tuple[Ar
     """
     frame, phi2 = chain.frame, pose_rate[2] ** 2
     acc_f, acc_g = frame.joint_motion(pose_acc)
-    acc_f = acc_f + chain.chord * chain.gamma_rate**2 - phi2 * frame.c_f
-    return frame.link_motion(acc_f, acc_g - phi2 * frame.c_g)
+    acc_f = acc_f + chain.chord * chain.beta_rate**2 - phi2 * frame.c_f
+    acc_g = acc_g - phi2 * frame.c_g
+    if chain.turning is not None:
+        acc_f, acc_g = acc_f - chain.sine * chain.turning, acc_g - chain.cosine * chain.turning
+    return frame.link_motion(acc_f, acc_g)
 
 
 def with_platform(plant: Plant, factor: Array) -> Plant:
@@ -453,14 +478,16 @@ def inverse_dynamics(
         (3,).
     """
     chain = close_chain(plant, pose, pose_rate)
-    frame, rate2, phi2 = chain.frame, chain.gamma_rate**2, pose_rate[2] ** 2
-    rho_acc, gamma_acc = straight_motion(chain, pose_rate, pose_acc)
+    frame, rate2, phi2 = chain.frame, chain.beta_rate**2, pose_rate[2] ** 2
+    rho_acc, beta_acc = straight_motion(chain, pose_rate, pose_acc)
     moment = plant.tip_mass * plant.length
     on_rho = plant.slider_link_mass * rho_acc - moment * (
-        chain.sine * gamma_acc + chain.cosine * rate2
+        chain.sine * beta_acc + chain.cosine * rate2
     )
-    on_gamma = plant.inertia * gamma_acc - moment * chain.sine * rho_acc
-    force_f, force_g = frame.joint_force(on_rho, on_gamma)
+    on_beta = plant.inertia * beta_acc - moment * chain.sine * rho_acc
+    if chain.turning is not None:
+        on_beta = on_beta + moment * chain.cosine * chain.turning
+    force_f, force_g = frame.joint_force(on_rho, on_beta)
     to_f = jnp.stack([frame.x, frame.y, -frame.c_g])
     to_g = jnp.stack([-frame.y, frame.x, frame.c_f])
     platform = platform_mass(plant, chain.turn)
@@ -494,10 +521,10 @@ def kinetic_energy(plant: Plant, chain: Chain, pose_rate: Array, q: Array, q_rat
         rotary = rotary - jnp.sum(spread.turning * q, axis=1)
     links = (
         plant.slider_link_mass * chain.rho_rate**2 / 2
-        + rotary * chain.gamma_rate**2 / 2
+        + rotary * chain.beta_rate**2 / 2
         + plant.modal_mass * jnp.sum(q_rate**2, axis=1) / 2
-        + chain.gamma_rate * jnp.sum(plant.c * q_rate, axis=1)
-        - chain.rho_rate * chain.gamma_rate * swing
+        + chain.beta_rate * jnp.sum(plant.c * q_rate, axis=1)
+        - chain.rho_rate * chain.beta_rate * swing
         - chain.rho_rate * push
     )
     platform = (

@@ -87,9 +87,9 @@ def plant_response(structure: Structure, case: Case, loop: Loop, pose: Array) ->
 
     def rates(pose_rate: Array) -> tuple[Array, Array]:
         chain = close_chain(plant, pose, pose_rate)
-        return chain.rho_rate, chain.gamma_rate
+        return chain.rho_rate, chain.beta_rate
 
-    to_rho, to_gamma = jax.jacfwd(rates)(still)  # (3 links, 3)
+    to_rho, to_beta = jax.jacfwd(rates)(still)  # (3 links, 3)
     chain = close_chain(plant, pose, still)
     platform = mass_matrix(platform_mass(plant, chain.turn))
     swing = -plant.tip_mass * chain.chord * chain.sine
@@ -97,13 +97,13 @@ def plant_response(structure: Structure, case: Case, loop: Loop, pose: Array) ->
         jnp.einsum("i,ip,iq->pq", *terms)
         for terms in (
             (plant.slider_link_mass, to_rho, to_rho),
-            (plant.inertia, to_gamma, to_gamma),
-            (swing, to_rho, to_gamma),
-            (swing, to_gamma, to_rho),
+            (plant.inertia, to_beta, to_beta),
+            (swing, to_rho, to_beta),
+            (swing, to_beta, to_rho),
         )
     )
     at_c, at_b, inertia = _from_chord(plant)
-    leave = to_gamma[:, :, None] * at_c[:, None] - (
+    leave = to_beta[:, :, None] * at_c[:, None] - (
         (chain.sine[:, None] * to_rho)[:, :, None] * at_b[:, None]
     )
     gains = drive_gains(DRIVES[structure.drive], drive)

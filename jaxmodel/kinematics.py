@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel import status
-from jaxmodel.lazy import jnp
+from jaxmodel.lazy import jax, jnp
+from jaxmodel.mechanisms.contract import Near
 from jaxmodel.parameters import Array
 from jaxmodel.plant import Plant
 from jaxmodel.trigonometry import sine_cosine
@@ -40,7 +41,7 @@ class Frame(NamedTuple):
 
     f points where bending moves C within its link: along t as the chord shortens, or along -n_t
     where Y_j(L) is not zero. When C of a rigid link moves by (f, g), rho moves by
-    rho_f f + rho_g g and gamma by gamma_f f + gamma_g g.
+    rho_f f + rho_g g and gamma by beta_f f + beta_g g.
     """
 
     x: Array  # direction of f in the plane [1]
@@ -49,22 +50,22 @@ class Frame(NamedTuple):
     c_g: Array
     rho_f: Array  # [1]
     rho_g: Array | None  # None: zero
-    gamma_f: Array  # [1/m]
-    gamma_g: Array
+    beta_f: Array  # [1/m]
+    beta_g: Array
 
     def link_motion(self, along_f: Array, along_g: Array) -> tuple[Array, Array]:
         """Rates of rho and gamma from those of C."""
         rho = self.rho_f * along_f
         if self.rho_g is not None:
             rho = rho + self.rho_g * along_g
-        return rho, self.gamma_f * along_f + self.gamma_g * along_g
+        return rho, self.beta_f * along_f + self.beta_g * along_g
 
-    def joint_force(self, on_rho: Array, on_gamma: Array) -> tuple[Array, Array]:
+    def joint_force(self, on_rho: Array, on_beta: Array) -> tuple[Array, Array]:
         """Force at C along f and g equivalent to forces on rho and gamma."""
-        g = self.gamma_g * on_gamma
+        g = self.beta_g * on_beta
         if self.rho_g is not None:
             g = g + self.rho_g * on_rho
-        return self.rho_f * on_rho + self.gamma_f * on_gamma, g
+        return self.rho_f * on_rho + self.beta_f * on_beta, g
 
     def joint_motion(self, pose_rate: Array) -> tuple[Array, Array]:
         """Velocity of C along f and g from that of the pose (accelerations without phi'^2)."""
@@ -83,15 +84,14 @@ class Chain(NamedTuple):
     turn: tuple[Array, Array]  # sin and cos of phi [1], () each
     cx: Array  # C - X in the plane [m]
     cy: Array
-    s: Array  # u.(C - A) [m]
-    h: Array  # n.(C - A) [m]
+    near: Near  # joints B
     chord: Array  # c [m]
-    root_squared: Array  # l2 - h^2, as it is [m2]
     sine: Array  # sin gamma [1]
     cosine: Array  # cos gamma [1]
-    rho: Array  # slider position [m]
+    rho: Array  # position of the actuated joint [m]
     rho_rate: Array  # [m/s]
-    gamma_rate: Array  # [rad/s]
+    beta_rate: Array  # of the link in the plane [rad/s]
+    turning: Array | None  # rho'^2/r, acceleration of B towards n [m/s2]; None: straight paths
 
 
 def close_chain(plant: Plant, pose: Array, pose_rate: Array, bend: Bend | None = None) -> Chain:
@@ -115,15 +115,12 @@ def close_chain(plant: Plant, pose: Array, pose_rate: Array, bend: Bend | None =
     cx = plant.joint_cos * cosine - plant.joint_sin * sine
     cy = plant.joint_sin * cosine + plant.joint_cos * sine
     x, y = pose[0] + cx, pose[1] + cy
-    s = plant.ux * x + plant.uy * y + plant.s0
-    h = plant.ux * y - plant.uy * x + plant.h0
     chord = plant.length if bend.shortening is None else plant.length - bend.shortening
     squared = chord * chord
     if bend.tip is not None:
         squared = squared + bend.tip * bend.tip
-    root_squared = squared - h * h
-    floor = (SINGULAR_MARGIN * plant.length) ** 2
-    root = jnp.sqrt(jnp.maximum(root_squared, floor))
+    near = plant.legs.near(x, y, squared, (SINGULAR_MARGIN * plant.length) ** 2)
+    root, h = near.root, near.across
     if bend.tip is None:
         product = 1 / (chord * root)  # one division for 1/c and 1/P
         inverse, over = chord * product, root * product
@@ -136,27 +133,26 @@ def close_chain(plant: Plant, pose: Array, pose_rate: Array, bend: Bend | None =
         cos_gamma = (chord * root + bend.tip * h) / squared
         f_u, f_n = sin_gamma, -cos_gamma
         ways = tuple(inverse * x for x in (-bend.tip, chord, -cos_gamma, sin_gamma))
-    f_x, f_y = plant.ux * f_u - plant.uy * f_n, plant.uy * f_u + plant.ux * f_n
+    f_x, f_y = near.x * f_u - near.y * f_n, near.y * f_u + near.x * f_n
     frame = Frame(f_x, f_y, f_x * cx + f_y * cy, f_x * cy - f_y * cx, *ways)
     along_f, along_g = frame.joint_motion(pose_rate)
     for rate in (bend.tip_rate, bend.shortening_rate):
         along_f = along_f if rate is None else along_f + rate
-    rho_rate, gamma_rate = frame.link_motion(along_f, along_g)
+    rho_rate, beta_rate = frame.link_motion(along_f, along_g)
     return Chain(
         bend=bend,
         frame=frame,
         turn=(sine, cosine),
         cx=cx,
         cy=cy,
-        s=s,
-        h=h,
+        near=near,
         chord=chord,
-        root_squared=root_squared,
         sine=sin_gamma,
         cosine=cos_gamma,
-        rho=s - root,
+        rho=near.position,
         rho_rate=rho_rate,
-        gamma_rate=gamma_rate,
+        beta_rate=beta_rate,
+        turning=None if near.curvature is None else near.curvature * rho_rate * rho_rate,
     )
 
 
@@ -169,15 +165,25 @@ def chain_status(plant: Plant, chain: Chain) -> Array:
         () code of `jaxmodel.status`, as a floating-point number.
     """
     margin = SINGULAR_MARGIN
-    is_out = jnp.any(chain.root_squared <= 0, axis=0)
-    near = (chain.sine < margin) | (chain.root_squared < (margin * plant.length) ** 2)
-    code = jnp.where(jnp.any(near, axis=0), status.SINGULAR, status.OK)
-    return jnp.where(is_out, status.OUT_OF_REACH, code).astype(chain.h.dtype)
+    is_out = jnp.any(chain.near.root_squared <= 0, axis=0)
+    is_near = (plant.legs.side(chain.sine) < margin) | (
+        chain.near.root_squared < (margin * plant.length) ** 2
+    )
+    code = jnp.where(jnp.any(is_near, axis=0), status.SINGULAR, status.OK)
+    return jnp.where(is_out, status.OUT_OF_REACH, code).astype(chain.sine.dtype)
 
 
 def link_angle(chain: Chain) -> Array:
     """gamma = beta - alpha [rad], (3,)."""
     return jnp.arctan2(chain.sine, chain.cosine)
+
+
+def link_direction(chain: Chain) -> Array:
+    """beta, of the links in the plane [rad], (3,)."""
+    near = chain.near
+    return jnp.arctan2(
+        chain.cosine * near.y + chain.sine * near.x, chain.cosine * near.x - chain.sine * near.y
+    )
 
 
 def singularity_distance(plant: Plant, pose: Array) -> Array:
@@ -189,10 +195,10 @@ def singularity_distance(plant: Plant, pose: Array) -> Array:
         plant: the machine.
         pose: of the undeformed machine, (N, 3) [m, m, rad].
     """
-    lanes = plant._replace(**{name: getattr(plant, name)[:, None] for name in _LINK_FIELDS})
+    lanes = over_poses(plant, 1)
     chain = close_chain(lanes, pose.T, jnp.zeros_like(pose.T))
     gamma = link_angle(chain)
-    nearest = jnp.min(jnp.minimum(gamma, jnp.pi / 2 - gamma))
+    nearest = jnp.min(jnp.minimum(plant.legs.side(gamma), jnp.pi / 2 - jnp.abs(gamma)))
     return jnp.minimum(nearest, jnp.min(hold(chain)))
 
 
@@ -217,6 +223,20 @@ def hold(chain: Chain) -> Array:
     return jnp.abs(determinant) / (size * np.sqrt(6.75))
 
 
+def over_poses(plant: Plant, axes: int) -> Plant:
+    """What `close_chain` needs of a machine, for poses on so many further axes."""
+
+    def wide(x: Array) -> Array:
+        return jnp.reshape(x, (*jnp.shape(x), *(1,) * axes))
+
+    return plant._replace(
+        legs=jax.tree.map(wide, plant.legs),
+        joint_cos=wide(plant.joint_cos),
+        joint_sin=wide(plant.joint_sin),
+        length=wide(plant.length),
+    )
+
+
 def inverse_kinematics(plant: Plant, pose: Array, pose_rate: Array) -> tuple[Array, Array]:
     """Slider positions [m] and rates [m/s] of the undeformed machine for poses on any time axis.
 
@@ -228,18 +248,9 @@ def inverse_kinematics(plant: Plant, pose: Array, pose_rate: Array) -> tuple[Arr
     Returns:
         (rho, rho_rate), (..., 3) each.
     """
-    lead = pose.shape[:-1]
-    lanes = plant._replace(
-        **{
-            name: jnp.reshape(getattr(plant, name), (3,) + (1,) * len(lead))
-            for name in _LINK_FIELDS
-        }
-    )
+    lanes = over_poses(plant, pose.ndim - 1)
     chain = close_chain(lanes, jnp.moveaxis(pose, -1, 0), jnp.moveaxis(pose_rate, -1, 0))
     return jnp.moveaxis(chain.rho, 0, -1), jnp.moveaxis(chain.rho_rate, 0, -1)
-
-
-_LINK_FIELDS = ("ux", "uy", "joint_cos", "joint_sin", "s0", "h0", "length")
 
 
 def path_status(plant: Plant, pose: Array) -> Array:
@@ -254,7 +265,7 @@ def path_status(plant: Plant, pose: Array) -> Array:
     Returns:
         (code (), index ()): code OK and index 0 if the whole path is fine.
     """
-    lanes = plant._replace(**{name: getattr(plant, name)[:, None] for name in _LINK_FIELDS})
+    lanes = over_poses(plant, 1)
     chain = close_chain(lanes, pose.T, jnp.zeros_like(pose.T))
     codes = chain_status(lanes, chain)
     is_loose = (codes == status.OK) & (hold(chain) < SINGULAR_MARGIN)
@@ -272,7 +283,7 @@ def lift(plant: Plant, pose: Array) -> Array:
         plant: the machine.
         pose: of the undeformed machine, (3,) [m, m, rad].
     """
-    return close_chain(plant, pose, jnp.zeros_like(pose)).h / plant.length
+    return close_chain(plant, pose, jnp.zeros_like(pose)).near.across / plant.length
 
 
 def closure_residual(chain: Chain, gamma: Array) -> Array:
@@ -286,6 +297,6 @@ def closure_residual(chain: Chain, gamma: Array) -> Array:
         components along u and n.
     """
     tip = 0.0 if chain.bend.tip is None else chain.bend.tip
-    along = chain.rho + chain.chord * jnp.cos(gamma) - tip * jnp.sin(gamma)
+    along = chain.chord * jnp.cos(gamma) - tip * jnp.sin(gamma)
     across = chain.chord * jnp.sin(gamma) + tip * jnp.cos(gamma)
-    return jnp.stack([chain.s - along, chain.h - across])
+    return jnp.stack([chain.near.root - along, chain.near.across - across])

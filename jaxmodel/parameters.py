@@ -9,27 +9,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numpy as np
-
 Array = Any  # a JAX or NumPy array, or a Python number
-
-#: Body angles psi [rad] of the platform joints for the two assemblies that fit the paper's text.
-ASSEMBLIES = {
-    "inward": (np.pi / 2, 7 * np.pi / 6, 11 * np.pi / 6),
-    "outward": (3 * np.pi / 2, np.pi / 6, 5 * np.pi / 6),
-}
-#: Home pose (x [m], y [m], phi [rad]) of the paper.
-HOME = (0.0, 0.0, np.pi / 6)
-
-
-class Geometry(NamedTuple):
-    """Guides and platform joints. The paper's guides are the sides of a triangle around O."""
-
-    guide_side: Array  # a [m], ()
-    guide_angle: Array  # alpha [rad], (3,)
-    joint_radius: Array  # distance platform centre - C_i [m], () or (3,)
-    joint_angle: Array  # psi, body angle of C_i [rad], (3,)
-    guide_offset: Array = 0.0  # how much further from O than the side a guide lies [m], () or (3,)
 
 
 class Masses(NamedTuple):
@@ -94,47 +74,8 @@ class Damping(NamedTuple):
 class Machine(NamedTuple):
     """All physical data of the mechanism with its patches."""
 
-    geometry: Geometry
+    geometry: Any  # a mechanism's, see `jaxmodel.mechanisms.contract`
     masses: Masses
     beam: Beam
     patches: Patches
     damping: Damping
-
-
-def paper_machine() -> Machine:
-    """The paper's 3-PRR manipulator.
-
-    Values not given in the paper (E, density, width, I_p, damping, PZT permittivity and
-    density) are the estimates listed in docs/theory.md.
-    """
-    return Machine(
-        geometry=Geometry(
-            guide_side=0.6,
-            guide_angle=np.array([2 * np.pi / 3, 4 * np.pi / 3, 0.0]),
-            joint_radius=0.12 / np.sqrt(3.0),
-            joint_angle=np.array(ASSEMBLIES["inward"]),
-        ),
-        masses=Masses(platform_mass=0.25, platform_inertia=3.0e-4, slider_mass=0.15),
-        beam=Beam(
-            length=0.2,
-            thickness=2e-3,
-            width=10e-3,
-            density=2750.0,
-            youngs_modulus=70e9,
-            stiffness_factor=1.0,
-            joint_inertia_b=0.0,
-            joint_inertia_c=0.0,
-        ),
-        patches=Patches(
-            center=np.tile([0.05, 0.10, 0.15], (3, 1)),
-            sensor_length=0.010,
-            actuator_length=0.030,
-            width=0.010,
-            thickness=0.2e-3,
-            youngs_modulus=66e9,
-            d31=-180e-12,
-            relative_permittivity=1750.0,
-            density=7800.0,
-        ),
-        damping=Damping(ratio=np.full((3, 1), 0.01), count=np.ones(3, int), exponent=0.0),
-    )

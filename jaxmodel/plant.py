@@ -12,19 +12,16 @@ from typing import NamedTuple
 
 from jaxmodel.beam import ModalBasis
 from jaxmodel.lazy import jnp
+from jaxmodel.mechanisms.contract import Legs
 from jaxmodel.parameters import Array, Damping, Machine
 
 
 class Plant(NamedTuple):
     """Machine and modal basis in the form the equations of motion use (shapes as above)."""
 
-    # guides: s = u.C + s0, h = n.C + h0
-    ux: Array  # direction of guide i [1], (3,)
-    uy: Array
+    legs: Legs  # paths of the near joints
     joint_cos: Array  # |PC| cos(psi) [m], (3,)
     joint_sin: Array  # |PC| sin(psi) [m], (3,)
-    s0: Array  # -u.A [m], (3,)
-    h0: Array  # -n.A [m], (3,)
     length: Array  # L [m], (3,)
     # rigid inertia
     slider_link_mass: Array  # m_b + m_s [kg], (3,)
@@ -69,9 +66,7 @@ def build_plant(
 ) -> Plant:
     """Collect machine and basis into a `Plant`.
 
-    Guide i starts at A_i = -r_i n_i - (a/2) u_i, r_i = a/(2 sqrt 3) + its offset,
-    u_i = (cos, sin) alpha_i, and n_i, the inward normal, is u_i turned by +90 deg. The payload
-    adds its mass, inertia and first moment to the platform's.
+    The payload adds its mass, inertia and first moment to the platform's.
 
     Args:
         machine: physical description.
@@ -85,7 +80,6 @@ def build_plant(
         Plant.
     """
     geometry, masses, beam = machine.geometry, machine.masses, machine.beam
-    angle = jnp.asarray(geometry.guide_angle)
     psi = jnp.asarray(geometry.joint_angle)
 
     def link(x: Array) -> Array:
@@ -98,12 +92,9 @@ def build_plant(
     if offset is not None:
         inertia = inertia + payload * jnp.sum(jnp.asarray(offset) ** 2)
     return Plant(
-        ux=jnp.cos(angle),
-        uy=jnp.sin(angle),
+        legs=geometry.legs(),
         joint_cos=link(geometry.joint_radius) * jnp.cos(psi),
         joint_sin=link(geometry.joint_radius) * jnp.sin(psi),
-        s0=link(geometry.guide_side / 2),
-        h0=link(geometry.guide_side / jnp.sqrt(12.0) + geometry.guide_offset),
         length=length,
         slider_link_mass=link(masses.slider_mass)
         + basis.link_mass

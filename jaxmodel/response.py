@@ -87,7 +87,7 @@ def bench_plant(structure: Structure, case: Case, pose: Array) -> BenchPlant:
 def _point_rates(loop: Loop, stations: Array, pose: Array, rate: Array) -> tuple[Array, Array]:
     """Velocities of the stations of straight links, across and along them [m/s], (3, S) each."""
     chain = close_chain(loop.plant, pose, rate)
-    across = stations * chain.gamma_rate[:, None] - (chain.sine * chain.rho_rate)[:, None]
+    across = stations * chain.beta_rate[:, None] - (chain.sine * chain.rho_rate)[:, None]
     return across, jnp.broadcast_to((chain.cosine * chain.rho_rate)[:, None], across.shape)
 
 

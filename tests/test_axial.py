@@ -13,7 +13,7 @@ from jaxmodel import axial, status
 from jaxmodel.bases import find_bases
 from jaxmodel.kinematics import close_chain
 from jaxmodel.linear import Moment, linearise, natural_modes
-from jaxmodel.parameters import HOME
+from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import prepare
 from studies.engine.preflight import check_run
 from studies.engine.runs import _simulate

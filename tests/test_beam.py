@@ -10,7 +10,8 @@ import pytest
 
 from jaxmodel import piezo
 from jaxmodel.beam import BASES, build_basis, held_frequency, pinned_free_roots
-from jaxmodel.parameters import Damping, paper_machine
+from jaxmodel.mechanisms.prrr.paper import paper_machine
+from jaxmodel.parameters import Damping
 from jaxmodel.plant import damping_ratio
 
 MACHINE = paper_machine()

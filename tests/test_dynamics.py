@@ -10,7 +10,8 @@ import pytest
 
 from jaxmodel import dynamics, kinematics, status
 from jaxmodel.beam import build_basis
-from jaxmodel.parameters import ASSEMBLIES, HOME, paper_machine
+from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES
+from jaxmodel.mechanisms.prrr.paper import HOME, paper_machine
 from jaxmodel.plant import build_plant
 from studies.reference import lagrangian as reference
 
@@ -82,14 +83,14 @@ def all_forms(basis, plant, motion, loads):
 def test_accelerations_equal_lagrangian_and_multiplier_form(kind, shortening, states):
     basis, plant = make(kind, shortening=shortening)
 
-    found, (pose_l, q_l), (pose_m, q_m, rho_m, gamma_m) = all_forms(basis, plant, *states)
+    found, (pose_l, q_l), (pose_m, q_m, rho_m, beta_m) = all_forms(basis, plant, *states)
     pairs = (
         (found.pose, pose_l),
         (found.modal, q_l),
         (found.pose, pose_m),
         (found.modal, q_m),
         (found.rho, rho_m),
-        (found.gamma, gamma_m),
+        (found.beta, beta_m),
     )
     for mine, wanted in pairs:
         axes = tuple(range(1, wanted.ndim))
@@ -117,9 +118,8 @@ def test_kinetic_energy_equals_quadrature_over_the_link(kind, states):
 
     def points(pose, q):
         """Points of the links in the plane, their sliders, (3, points, 2) and (3, 2)."""
-        rho, gamma = reference.close(MACHINE, basis, pose, q)
+        rho, beta = reference.close(MACHINE, basis, pose, q)
         corner, u, _ = reference.guides(MACHINE.geometry)
-        beta = gamma + MACHINE.geometry.guide_angle
         along = jnp.stack([jnp.cos(beta), jnp.sin(beta)], axis=1)[:, None]
         across = jnp.stack([-jnp.sin(beta), jnp.cos(beta)], axis=1)[:, None]
         slider = corner + rho[:, None] * u
@@ -156,12 +156,13 @@ def test_closure_holds_to_rounding_along_a_random_motion(kind):
         (pose, q), (pose_rate, q_rate) = jax.jvp(path, (t,), (1.0,))
         chain = dynamics.modal_chain(plant, pose, pose_rate, q, q_rate)
         gamma = kinematics.link_angle(chain)
-        tips = reference.link_tips(MACHINE, basis, chain.rho, gamma, q)
+        beta = kinematics.link_direction(chain)
+        tips = reference.link_tips(MACHINE, basis, chain.rho, beta, q)
         rates = jax.jvp(lambda t: reference.close(MACHINE, basis, *path(t)), (t,), (1.0,))[1]
         return (
             tips - reference.platform_joints(MACHINE.geometry, pose),
             kinematics.closure_residual(chain, gamma),
-            (chain.rho_rate - rates[0], chain.gamma_rate - rates[1]),
+            (chain.rho_rate - rates[0], chain.beta_rate - rates[1]),
         )
 
     outside, own, rate_errors = along(np.linspace(0, 1, 500))
@@ -187,8 +188,8 @@ def test_axial_force_is_the_one_that_bending_feels(states):
     @jax.vmap
     def forces(m, load):
         found, chain = closed_form(plant, m, load), dynamics.modal_chain(plant, *m)
-        inertia = plant.modal_mass[:, None] * (found.modal - m.q * chain.gamma_rate[:, None] ** 2)
-        drag = plant.c * found.gamma[:, None] - plant.b * (chain.sine * found.rho)[:, None]
+        inertia = plant.modal_mass[:, None] * (found.modal - m.q * chain.beta_rate[:, None] ** 2)
+        drag = plant.c * found.beta[:, None] - plant.b * (chain.sine * found.rho)[:, None]
         elastic = plant.stiffness * m.q + plant.damping * m.q_rate - load.modal
         return found.axial, -(inertia + drag + elastic) / (plant.shortening * m.q)
 

@@ -14,7 +14,7 @@ from jaxmodel.dynamics import kinetic_energy, modal_chain, potential_energy
 from jaxmodel.integrator import exponential_step
 from jaxmodel.kinematics import inverse_kinematics
 from jaxmodel.loop import PlantState, plant_rates, plant_step
-from jaxmodel.parameters import HOME
+from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import prepare
 from studies.reference import lagrangian as reference
 from studies.study.cases import as_arrays, build_case, build_structure

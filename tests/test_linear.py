@@ -8,7 +8,7 @@ import pytest
 
 from jaxmodel.linear import flatten, frequency_response, linearise, natural_modes, unflatten
 from jaxmodel.loop import PlantState
-from jaxmodel.parameters import HOME
+from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import prepare
 from jaxmodel.simulate import simulate
 from studies.reference import tables

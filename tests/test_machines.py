@@ -10,7 +10,7 @@ import pytest
 
 from jaxmodel import dynamics, kinematics, status
 from jaxmodel.beam import build_basis
-from jaxmodel.parameters import HOME
+from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.plant import build_plant
 from studies import cli
 from studies.engine.preflight import check_run
@@ -304,9 +304,10 @@ def test_a_sketch_stands_where_the_machine_does():
     slider, joint = standing(case, pose)
     plant = build_plant_of(study)
     chain = kinematics.close_chain(plant, jnp.array(pose), jnp.zeros(3))
-    u = np.stack([plant.ux, plant.uy], axis=1)
+    guide = plant.legs
+    u = np.stack([guide.ux, guide.uy], axis=1)
     n = np.stack([-u[:, 1], u[:, 0]], axis=1)
-    corner = -np.asarray(plant.s0)[:, None] * u - np.asarray(plant.h0)[:, None] * n
+    corner = -np.asarray(guide.s0)[:, None] * u - np.asarray(guide.h0)[:, None] * n
     np.testing.assert_allclose(slider, corner + np.asarray(chain.rho)[:, None] * u, atol=1e-12)
     centre = joint - pose[:2]
     np.testing.assert_allclose(centre, np.stack([chain.cx, chain.cy], axis=1), atol=1e-12)

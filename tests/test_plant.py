@@ -7,7 +7,7 @@ import pytest
 from scipy.io import loadmat
 
 from jaxmodel.frequency_response import controller_response
-from jaxmodel.parameters import HOME
+from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import prepare
 from studies.engine.preflight import check_run
 from studies.engine.runs import run_study

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxmodel import status
-from jaxmodel.parameters import HOME
+from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.simulate import _share_on
 from studies import config
 from studies.engine.preflight import check_run

@@ -11,7 +11,7 @@ import scipy.linalg
 from jaxmodel import sampled_loop
 from jaxmodel.linear import linearise, natural_modes
 from jaxmodel.linear_residual import linear_residual
-from jaxmodel.parameters import HOME
+from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import (
     closed_loop,

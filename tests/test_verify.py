@@ -43,8 +43,8 @@ FAULTS = {
     ),
     "centrifugal force doubled": Fault(
         "jaxmodel/dynamics.py",
-        "push = piezo + thrown * (chain.gamma_rate * chain.gamma_rate)[:, None]",
-        "push = piezo + 2 * thrown * (chain.gamma_rate * chain.gamma_rate)[:, None]",
+        "push = piezo + thrown * (chain.beta_rate * chain.beta_rate)[:, None]",
+        "push = piezo + 2 * thrown * (chain.beta_rate * chain.beta_rate)[:, None]",
         "mechanics",
     ),
     "no shortening": Fault(

@@ -343,12 +343,12 @@ def by_c(work: Work, compiler: str, width: int) -> Callable[[], Any]:
     start = jax.jit(begin, static_argnums=0)(structure, jax.tree.map(lambda x: x[0], work.first(1)))
     plant, drive, n = start.loop.plant, start.loop.drive, structure.n_steps
     fields = (
-        plant.ux,
-        plant.uy,
+        plant.legs.ux,
+        plant.legs.uy,
         plant.joint_cos,
         plant.joint_sin,
-        plant.s0,
-        plant.h0,
+        plant.legs.s0,
+        plant.legs.h0,
         plant.length,
         plant.slider_link_mass,
         plant.tip_mass,

@@ -16,7 +16,9 @@ import numpy as np
 from jaxmodel.beam import ModalBasis
 from jaxmodel.dynamics import Accelerations, accelerations, modal_chain
 from jaxmodel.kinematics import Chain
-from jaxmodel.parameters import Geometry, Machine
+from jaxmodel.mechanisms.prrr import guides as prrr
+from jaxmodel.mechanisms.rrr import cranks as rrr
+from jaxmodel.parameters import Machine
 from jaxmodel.plant import Plant
 
 
@@ -36,7 +38,7 @@ class Loads(NamedTuple):
     modal: Any  # on the modal coordinates [N], (3, R)
 
 
-def guides(geometry: Geometry) -> tuple[jax.Array, jax.Array, jax.Array]:
+def guides(geometry: prrr.Geometry) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Starting corners A_i [m], directions u_i and inward normals n_i, (3, 2) each."""
     angle = geometry.guide_angle
     u = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
@@ -45,7 +47,40 @@ def guides(geometry: Geometry) -> tuple[jax.Array, jax.Array, jax.Array]:
     return -away[:, None] * n - geometry.guide_side / 2 * u, u, n
 
 
-def platform_joints(geometry: Geometry, pose: jax.Array) -> jax.Array:
+def pivots(geometry: rrr.Geometry) -> jax.Array:
+    """A_i of the cranks [m], (n, 2)."""
+    angle = geometry.pivot_angle
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1) * jnp.reshape(
+        geometry.pivot_radius, (-1, 1)
+    )
+
+
+def near_joints(geometry: Any, rho: Any) -> Any:
+    """Joints B_i [m] by the actuated coordinates, (n, 2)."""
+    if isinstance(geometry, prrr.Geometry):
+        corner, u, _ = guides(geometry)
+        return corner + rho[:, None] * u
+    theta = geometry.zero_angle + geometry.elbow * rho / geometry.crank_length
+    crank = jnp.stack([jnp.cos(theta), jnp.sin(theta)], axis=1)
+    return pivots(geometry) + jnp.reshape(geometry.crank_length, (-1, 1)) * crank
+
+
+def reach(geometry: Any, joints: Any, distance: Any) -> Any:
+    """Actuated coordinates that put B_i at a distance from C_i [m], (n,)."""
+    if isinstance(geometry, prrr.Geometry):
+        corner, u, n = guides(geometry)
+        to_joint = joints - corner
+        slant = jnp.arcsin(jnp.sum(to_joint * n, axis=1) / distance)
+        return jnp.sum(to_joint * u, axis=1) - distance * jnp.cos(slant)
+    far, a = joints - pivots(geometry), geometry.crank_length
+    square = jnp.sum(far**2, axis=1)
+    between = jnp.arccos((square + a**2 - distance**2) / (2 * a * jnp.sqrt(square)))
+    theta = jnp.arctan2(far[:, 1], far[:, 0]) - geometry.elbow * between
+    turn = theta - geometry.zero_angle
+    return geometry.elbow * a * jnp.arctan2(jnp.sin(turn), jnp.cos(turn))
+
+
+def platform_joints(geometry: Any, pose: jax.Array) -> jax.Array:
     """Joints C_i [m] of the platform, (3, 2)."""
     angle = geometry.joint_angle + pose[2]
     radius = jnp.broadcast_to(geometry.joint_radius, (3,))
@@ -96,47 +131,45 @@ def moment_of_inertia(basis: ModalBasis, q: jax.Array) -> Any:
     return basis.inertia - jnp.einsum("ij,ijk,ik->i", q, basis.centrifugal, q)
 
 
-def link_tips(machine: Machine, basis: ModalBasis, rho: jax.Array, gamma: Any, q: jax.Array) -> Any:
-    """Joints C_i [m] from slider and bent link, (3, 2)."""
-    corner, u, _ = guides(machine.geometry)
-    beta = gamma + machine.geometry.guide_angle
+def link_tips(machine: Machine, basis: ModalBasis, rho: jax.Array, beta: Any, q: jax.Array) -> Any:
+    """Joints C_i [m] from near joint and bent link, (n, 2)."""
     along = jnp.stack([jnp.cos(beta), jnp.sin(beta)], axis=1)
     across = jnp.stack([-jnp.sin(beta), jnp.cos(beta)], axis=1)
     tip, chord = tip_deflection(basis, q), chord_length(machine, basis, q)
-    return corner + rho[:, None] * u + chord[:, None] * along + tip[:, None] * across
+    near = near_joints(machine.geometry, rho)
+    return near + chord[:, None] * along + tip[:, None] * across
 
 
 def close(machine: Machine, basis: ModalBasis, pose: jax.Array, q: jax.Array) -> Any:
-    """(rho [m], gamma [rad]), (3,) each, from the triangle of slider, joint and guide."""
-    corner, u, n = guides(machine.geometry)
-    to_joint = platform_joints(machine.geometry, pose) - corner
+    """(rho [m], beta [rad]), (n,) each, from the triangle of near joint, far joint and path."""
+    joints = platform_joints(machine.geometry, pose)
     tip, length = tip_deflection(basis, q), chord_length(machine, basis, q)
-    distance = jnp.sqrt(length**2 + tip**2)
-    slant = jnp.arcsin(jnp.sum(to_joint * n, axis=1) / distance)
-    rho = jnp.sum(to_joint * u, axis=1) - distance * jnp.cos(slant)
-    return rho, slant - jnp.arctan2(tip, length)
+    rho = reach(machine.geometry, joints, jnp.sqrt(length**2 + tip**2))
+    link = joints - near_joints(machine.geometry, rho)
+    return rho, jnp.arctan2(link[:, 1], link[:, 0]) - jnp.arctan2(tip, length)
 
 
 def kinetic_energy(
     machine: Machine,
     basis: ModalBasis,
-    gamma: Any,
+    joints: tuple[Any, Any],
     pose: jax.Array,
     q: jax.Array,
-    rho_rate: jax.Array,
-    gamma_rate: jax.Array,
+    joint_rates: tuple[Any, Any],
     pose_rate: jax.Array,
     q_rate: jax.Array,
 ) -> Any:
     """T [J] from the velocity a + x b + sum_j Y_j(x) c_j of the points of a link.
 
     Bending moves a point inwards along the chord; squares of that motion's speed are neglected.
+    `joints` are (rho, beta).
     """
-    along = jnp.stack([jnp.cos(gamma), jnp.sin(gamma)], axis=1)  # in the guide's frame
-    across = jnp.stack([-jnp.sin(gamma), jnp.cos(gamma)], axis=1)
-    a = rho_rate[:, None] * jnp.array([1.0, 0.0])
-    b = gamma_rate[:, None] * across
-    turning = gamma_rate[:, None] * q
+    (rho, beta), (rho_rate, beta_rate) = joints, joint_rates
+    along = jnp.stack([jnp.cos(beta), jnp.sin(beta)], axis=1)
+    across = jnp.stack([-jnp.sin(beta), jnp.cos(beta)], axis=1)
+    a = jax.jvp(lambda rho: near_joints(machine.geometry, rho), (rho,), (rho_rate,))[1]
+    b = beta_rate[:, None] * across
+    turning = beta_rate[:, None] * q
     c = q_rate[:, :, None] * across[:, None] - turning[:, :, None] * along[:, None]
     a_dot_c = jnp.einsum("id,ijd->ij", a, c)
     b_dot_c = jnp.einsum("id,ijd->ij", b, c)
@@ -195,9 +228,8 @@ def by_lagrangian(machine: Machine, basis: ModalBasis, motion: RigidState, loads
         return close(machine, basis, *split(z))
 
     def energy(z: Any, z_rate: Any) -> Any:
-        (_, gamma), (rho_rate, gamma_rate) = jax.jvp(joint_coordinates, (z,), (z_rate,))
-        rates = (rho_rate, gamma_rate, *split(z_rate))
-        return kinetic_energy(machine, basis, gamma, *split(z), *rates)
+        joints, rates = jax.jvp(joint_coordinates, (z,), (z_rate,))
+        return kinetic_energy(machine, basis, joints, *split(z), rates, *split(z_rate))
 
     z = jnp.concatenate([motion.pose, motion.q.ravel()])
     z_rate = jnp.concatenate([motion.pose_rate, motion.q_rate.ravel()])
@@ -209,20 +241,21 @@ def by_lagrangian(machine: Machine, basis: ModalBasis, motion: RigidState, loads
 
 
 def by_multipliers(machine: Machine, basis: ModalBasis, motion: RigidState, loads: Loads) -> Any:
-    """(X'', q'', rho'', gamma'') from (5): coordinates (rho, gamma, X, q), constraints (6)."""
+    """(X'', q'', rho'', beta'') from (5): coordinates (rho, beta, X, q), constraints (6)."""
     shape = motion.q.shape
 
     def split(y: Any) -> Any:
         return y[:3], y[3:6], y[6:9], y[9:].reshape(shape)
 
     def constraints(y: Any) -> Any:
-        rho, gamma, pose, q = split(y)
-        tips = link_tips(machine, basis, rho, gamma, q)
+        rho, beta, pose, q = split(y)
+        tips = link_tips(machine, basis, rho, beta, q)
         return (tips - platform_joints(machine.geometry, pose)).ravel()
 
     def energy(y: Any, y_rate: Any) -> Any:
-        _, gamma, pose, q = split(y)
-        return kinetic_energy(machine, basis, gamma, pose, q, *split(y_rate))
+        rho, beta, pose, q = split(y)
+        rho_rate, beta_rate, *rates = split(y_rate)
+        return kinetic_energy(machine, basis, (rho, beta), pose, q, (rho_rate, beta_rate), *rates)
 
     def all_coordinates(z: Any) -> Any:
         pose, q = z
@@ -238,8 +271,8 @@ def by_multipliers(machine: Machine, basis: ModalBasis, motion: RigidState, load
     curvature = jax.jvp(lambda y: jax.jvp(constraints, (y,), (y_rate,))[1], (y,), (y_rate,))[1]
     system = jnp.block([[mass, jacobian.T], [jacobian, jnp.zeros((6, 6))]])
     solution = jnp.linalg.solve(system, jnp.concatenate([load - inertial, -curvature]))
-    rho_acc, gamma_acc, pose_acc, q_acc = split(solution[: y.size])
-    return pose_acc, q_acc, rho_acc, gamma_acc
+    rho_acc, beta_acc, pose_acc, q_acc = split(solution[: y.size])
+    return pose_acc, q_acc, rho_acc, beta_acc
 
 
 def rk4_step(derivative: Any, state: Any, step: Any, inputs: Any) -> Any:

@@ -15,7 +15,9 @@ import numpy as np
 
 from jaxmodel import dynamics
 from jaxmodel.beam import build_basis
-from jaxmodel.parameters import Damping, Geometry, Masses, paper_machine
+from jaxmodel.mechanisms.prrr.guides import Geometry
+from jaxmodel.mechanisms.prrr.paper import paper_machine
+from jaxmodel.parameters import Damping, Masses
 from jaxmodel.plant import build_plant
 from studies.engine.programs import kept_jit
 from studies.reference.lagrangian import rk4_step

@@ -64,14 +64,11 @@ def _positions(
         structure.n_modes,
         plant.length[:, None] * along,
     ).deflection_at
-    u = jnp.stack([plant.ux, plant.uy], axis=1)
-    n = jnp.stack([-plant.uy, plant.ux], axis=1)
-    corner = -plant.h0[:, None] * n - plant.s0[:, None] * u
 
     def one(pose: Array, q: Array) -> tuple[Array, Array, Array]:
         chain = modal_chain(plant, pose, jnp.zeros_like(pose), q, jnp.zeros_like(q))
-        slider = corner + chain.rho[:, None] * u
         joint = pose[:2] + jnp.stack([chain.cx, chain.cy], axis=1)
+        slider = joint - jnp.stack(chain.near.to_far(), axis=1)
         chord = joint - slider
         across = jnp.stack([-chord[:, 1], chord[:, 0]], axis=1) / plant.length[:, None]
         bent = exaggeration * jnp.einsum("isr,ir->is", shape, q)

@@ -28,7 +28,8 @@ from jaxmodel.case import (
 from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law
-from jaxmodel.parameters import ASSEMBLIES, Beam, Damping, Geometry, Machine, Masses, Patches
+from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES, Geometry
+from jaxmodel.parameters import Beam, Damping, Machine, Masses, Patches
 from studies.study.consistency import patch_centers
 from studies.study.fields import Columns, Fields
 from studies.study.numbers import Numbers, one_study, study_numbers

@@ -20,8 +20,8 @@ from jaxmodel.estimator import KINDS
 from jaxmodel.hysteresis import WIDEST
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law
+from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.motion import PROFILES
-from jaxmodel.parameters import HOME
 from jaxmodel.shaper import SHAPERS
 from jaxmodel.table import Table
 from studies.errors import StudyError, field_error

@@ -15,7 +15,7 @@ import numpy as np
 from jaxmodel.case import Drive
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import SliderError
-from jaxmodel.parameters import ASSEMBLIES
+from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES
 from studies.errors import StudyError, field_error
 from studies.study.consistency import each_link
 from studies.study.spec import AUTO, Study

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxmodel.beam import BASES, ModalBasis
 from jaxmodel.case import Case, Structure
-from jaxmodel.kinematics import path_status
+from jaxmodel.kinematics import link_direction, path_status
 from jaxmodel.loop import Loop
 from jaxmodel.parameters import Damping, Machine
 from jaxmodel.plant import Plant, build_plant
@@ -126,8 +126,7 @@ def _both(machine: Machine, basis: ModalBasis, plant: Plant, states: Any) -> Any
     def one(motion: RigidState, loads: Loads) -> Any:
         chain, found = closed_form(plant, motion, loads)
         pose, modal = by_lagrangian(machine, basis, motion, loads)
-        gamma = jnp.arctan2(chain.sine, chain.cosine)
-        tips = link_tips(machine, basis, chain.rho, gamma, motion.q)
+        tips = link_tips(machine, basis, chain.rho, link_direction(chain), motion.q)
         gap = jnp.abs(tips - platform_joints(machine.geometry, motion.pose)).max()
         joined = [
             jnp.concatenate([a, b.ravel()]) for a, b in ((found.pose, found.modal), (pose, modal))

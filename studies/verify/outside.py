@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.linear import linearise, natural_modes
-from jaxmodel.parameters import HOME
+from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import prepare
 from jaxmodel.simulate import simulate
 from studies.engine.programs import kept_jit

@@ -1,0 +1,1 @@
+"""Mechanisms: one folder each, `contract` says what is in it."""

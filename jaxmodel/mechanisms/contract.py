@@ -1,0 +1,57 @@
+"""What a mechanism is: how the near joints of its links move.
+
+All mechanisms here are closed chains in the plane whose flexible links end at joints C of a
+platform, a rigid body or a point. The near joint B of a link is driven along a path: a straight
+guide, or the circle of a crank. That path, and where on it B must be for a given C, is all that
+distinguishes one mechanism from another in the equations of motion.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+from jaxmodel.lazy import jnp
+from jaxmodel.parameters import Array
+
+
+class Near(NamedTuple):
+    """The near joints B of the links for given far joints C, (n,) each.
+
+    u is the direction in which B moves, n that direction turned by +90 deg.
+    """
+
+    x: Array  # of u [1]
+    y: Array
+    root: Array  # P = u.(C - B), made safe where there is none [m]
+    root_squared: Array  # its square as it is: not positive where C is out of reach [m2]
+    across: Array  # h = n.(C - B) [m]
+    position: Array  # rho, of B along its path [m]
+    curvature: Array | None = None  # of the path, towards n [1/m]; None: it is straight
+
+    def to_far(self) -> tuple[Array, Array]:
+        """C - B in the plane [m]."""
+        return (
+            self.root * self.x - self.across * self.y,
+            self.root * self.y + self.across * self.x,
+        )
+
+
+class Legs(Protocol):
+    """Constants of the paths: a NamedTuple of arrays, (n,) each, whose type is the mechanism."""
+
+    def side(self, gamma: Array) -> Array:
+        """Of a link's angle or its sine: positive on the right side of the path."""
+
+    def near(self, x: Array, y: Array, squared: Array, floor: Array) -> Near:
+        """Where the near joints are.
+
+        Args:
+            x, y: of the far joints C [m], (n,) each.
+            squared: distance of C from B [m2].
+            floor: `root_squared` is no less in `root` [m2].
+        """
+
+
+def safe_root(squared: Array, floor: Array) -> Array:
+    """Root of a number that may be negative where nothing depends on it."""
+    return jnp.sqrt(jnp.maximum(squared, floor))

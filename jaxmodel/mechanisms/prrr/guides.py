@@ -1,0 +1,62 @@
+"""Guides: straight paths of the near joints, rho along them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxmodel.lazy import jnp
+from jaxmodel.mechanisms.contract import Near, safe_root
+from jaxmodel.parameters import Array
+
+#: Body angles psi [rad] of the platform joints for the two assemblies that fit the paper's text.
+ASSEMBLIES = {
+    "inward": (np.pi / 2, 7 * np.pi / 6, 11 * np.pi / 6),
+    "outward": (3 * np.pi / 2, np.pi / 6, 5 * np.pi / 6),
+}
+
+
+class Guides(NamedTuple):
+    """Guide i starts at A_i and runs along u_i; s = u.C + s0, h = n.C + h0, (3,) each."""
+
+    ux: Array  # direction [1]
+    uy: Array
+    s0: Array  # -u.A [m]
+    h0: Array  # -n.A [m]
+
+    def side(self, gamma: Array) -> Array:
+        """A link along its guide is about to change to the other side of it."""
+        return gamma
+
+    def near(self, x: Array, y: Array, squared: Array, floor: Array) -> Near:
+        """P = sqrt(l2 - h^2), rho = s - P."""
+        s = self.ux * x + self.uy * y + self.s0
+        h = self.ux * y - self.uy * x + self.h0
+        root_squared = squared - h * h
+        root = safe_root(root_squared, floor)
+        return Near(self.ux, self.uy, root, root_squared, h, s - root)
+
+
+class Geometry(NamedTuple):
+    """Guides and platform joints. The paper's guides are the sides of a triangle around O."""
+
+    guide_side: Array  # a [m], ()
+    guide_angle: Array  # alpha [rad], (3,)
+    joint_radius: Array  # distance platform centre - C_i [m], () or (3,)
+    joint_angle: Array  # psi, body angle of C_i [rad], (3,)
+    guide_offset: Array = 0.0  # how much further from O than the side a guide lies [m], () or (3,)
+
+    def legs(self) -> Guides:
+        """A_i = -r_i n_i - (a/2) u_i, r_i = a/(2 sqrt 3) + the guide's offset."""
+        angle = jnp.asarray(self.guide_angle)
+
+        def link(x: Array) -> Array:
+            return jnp.broadcast_to(jnp.asarray(x), angle.shape)
+
+        return Guides(
+            ux=jnp.cos(angle),
+            uy=jnp.sin(angle),
+            s0=link(self.guide_side / 2),
+            h0=link(self.guide_side / jnp.sqrt(12.0) + self.guide_offset),
+        )

@@ -1,0 +1,83 @@
+"""Cranks: circles as the paths of the near joints, rho the arc from a zero direction."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from jaxmodel.lazy import jnp
+from jaxmodel.mechanisms.contract import Near, safe_root
+from jaxmodel.parameters import Array
+
+#: Keeps a far joint from being on a pivot [m2].
+TINY_AREA = 1e-20
+
+
+class Cranks(NamedTuple):
+    """Crank i turns about A_i, (n,) each.
+
+    The direction of B is that in which rho grows, so that P is positive: against the clock for
+    elbows of +1, with it for those of -1.
+    """
+
+    x: Array  # of A [m]
+    y: Array
+    length: Array  # a [m]
+    elbow: Array  # 1: C lies to the left of the crank, -1: to its right
+    zero_x: Array  # direction of the crank at rho = 0 [1]
+    zero_y: Array
+
+    def side(self, gamma: Array) -> Array:
+        """A link may stand at any angle to the path but across it, in line with the crank."""
+        return jnp.ones_like(gamma)
+
+    def near(self, x: Array, y: Array, squared: Array, floor: Array) -> Near:
+        """With D = C - A, along the crank k = (D^2 + a^2 - l2)/(2 a) and P = sqrt(D^2 - k^2)."""
+        far_x, far_y = x - self.x, y - self.y
+        far = far_x * far_x + far_y * far_y
+        k = (far + self.length * self.length - squared) / (2 * self.length)
+        root_squared = far - k * k
+        root = safe_root(root_squared, floor)
+        left = self.elbow * root  # of D from the crank
+        scale = 1 / jnp.maximum(far, TINY_AREA)
+        crank_x = scale * (k * far_x + left * far_y)
+        crank_y = scale * (k * far_y - left * far_x)
+        turned_x = self.zero_x * crank_x + self.zero_y * crank_y
+        turned_y = self.zero_x * crank_y - self.zero_y * crank_x
+        arc = self.elbow * self.length
+        return Near(
+            x=-self.elbow * crank_y,
+            y=self.elbow * crank_x,
+            root=root,
+            root_squared=root_squared,
+            across=self.elbow * (self.length - k),
+            position=arc * jnp.arctan2(turned_y, turned_x),
+            curvature=1 / arc,
+        )
+
+
+class Geometry(NamedTuple):
+    """Cranks about pivots on a circle around O, and platform joints."""
+
+    pivot_radius: Array  # distance O - A_i [m], () or (n,)
+    pivot_angle: Array  # direction of A_i from O [rad], (n,)
+    crank_length: Array  # a [m], () or (n,)
+    elbow: Array  # 1 or -1, see `Cranks`, () or (n,)
+    zero_angle: Array  # direction of a crank at rho = 0 [rad], (n,)
+    joint_radius: Array  # distance platform centre - C_i [m], () or (n,)
+    joint_angle: Array  # body angle of C_i [rad], (n,)
+
+    def legs(self) -> Cranks:
+        """A_i = r_i (cos, sin) of the pivot's direction."""
+        pivot, zero = jnp.asarray(self.pivot_angle), jnp.asarray(self.zero_angle)
+
+        def link(x: Array) -> Array:
+            return jnp.broadcast_to(jnp.asarray(x), pivot.shape)
+
+        return Cranks(
+            x=self.pivot_radius * jnp.cos(pivot),
+            y=self.pivot_radius * jnp.sin(pivot),
+            length=link(self.crank_length),
+            elbow=link(self.elbow),
+            zero_x=jnp.cos(zero),
+            zero_y=jnp.sin(zero),
+        )
