@@ -141,18 +141,23 @@ def axial_compliance(beam: Beam) -> Array:
 
 
 def stretch_error(chain: Chain, stretch: Array) -> Array:
-    """Platform displacement by stretching links while the sliders stay put [m, m, rad], (3,).
+    """Platform displacement by stretching links while the near joints stay put, (n,).
 
-    Each joint C moves by the stretch along its link: t.J X = stretch, three equations for X.
+    Each joint C moves by the stretch along its link: t.J X = stretch, as many equations for X.
 
     Args:
         chain: at this pose.
         stretch: N L/(E A) of each link [m], (3,).
     """
     frame = chain.frame
-    x, y, turn = frame.x, frame.y, -frame.c_g
-    if chain.bend.tip is not None:  # f = -n_t, g = t
-        x, y, turn = -frame.y, frame.x, frame.c_f
+    is_turned = chain.bend.tip is not None  # f = -n_t, g = t
+    x, y = (-frame.y, frame.x) if is_turned else (frame.x, frame.y)
+    if frame.c_f is None or frame.c_g is None:
+        over = 1 / (x[0] * y[1] - x[1] * y[0])
+        return over * jnp.stack(
+            [y[1] * stretch[0] - y[0] * stretch[1], x[0] * stretch[1] - x[1] * stretch[0]]
+        )
+    turn = frame.c_f if is_turned else -frame.c_g
     cross = (
         y[1] * turn[2] - y[2] * turn[1],
         y[2] * turn[0] - y[0] * turn[2],

@@ -130,8 +130,10 @@ def accelerations(
             end, joint = _release_end(plant, chain, joint, q, pull, spread)
     else:
         joint = _joint(chain, _rigid_link(plant, chain, swing, slider_force))
-    phi2 = pose_rate[2] * pose_rate[2]
-    rates = swing.f - phi2 * chain.frame.c_f, swing.g - phi2 * chain.frame.c_g
+    rates, phi2 = (swing.f, swing.g), None
+    if chain.turn is not None:
+        phi2 = pose_rate[2] * pose_rate[2]
+        rates = swing.f - phi2 * chain.frame.c_f, swing.g - phi2 * chain.frame.c_g
     pose_acc = _pose_acceleration(plant, chain, joint, rates, phi2, wrench)
 
     acc_f, acc_g = (a + b for a, b in zip(rates, chain.frame.joint_motion(pose_acc), strict=True))
@@ -344,17 +346,20 @@ def _release_end(
 class Platform(NamedTuple):
     """Inertia of platform and payload: M_p X'' - phi'^2 moment = forces on the platform."""
 
-    matrix: tuple[Array | None, ...]  # M_p, upper triangle [kg, kg m, kg m2], () each; None: zero
+    # M_p, upper triangle [kg, kg m, kg m2], () each; None: zero; of a point without phi
+    matrix: tuple[Array | None, ...]
     moment: tuple[Array, Array] | None  # mass times its centre from X [kg m]; None: centre at X
 
 
-def platform_mass(plant: Plant, turn: tuple[Array, Array]) -> Platform:
+def platform_mass(plant: Plant, turn: tuple[Array, Array] | None) -> Platform:
     """M_p = (m 0 -s_y; 0 m s_x; -s_y s_x I), (s_x, s_y) the first moment turned by phi.
 
     Args:
         plant: the machine.
-        turn: sin and cos of phi [1].
+        turn: sin and cos of phi [1]; None: the platform is a point.
     """
+    if turn is None:
+        return Platform((plant.platform_mass, None, plant.platform_mass), None)
     mass, inertia = plant.platform_mass, plant.platform_inertia
     if plant.platform_moment is None:
         return Platform((mass, None, None, mass, None, inertia), None)
@@ -368,7 +373,7 @@ def _pose_acceleration(
     chain: Chain,
     joint: _Joint,
     rates: tuple[Array, Array],
-    phi2: Array,
+    phi2: Array | None,
     wrench: Array | None,
 ) -> Array:
     """Solve M_p X'' - phi'^2 moment + sum J^t (W (J X'' + rates) + load) = wrench over the links.
@@ -381,8 +386,10 @@ def _pose_acceleration(
     f_x, g_x = x * joint.ff - y * joint.fg, x * joint.fg - y * joint.gg
     w_xx, w_xy = x * f_x - y * g_x, y * f_x + x * g_x
     w_yy = joint.ff + joint.gg - w_xx
-    turn_x, turn_y = cx * w_xy - cy * w_xx, cx * w_yy - cy * w_xy  # phi'' with x'' and y''
-    links = (w_xx, w_xy, turn_x, w_yy, turn_y, cx * turn_y - cy * turn_x)
+    links: tuple[Array, ...] = (w_xx, w_xy, w_yy)
+    if cx is not None and cy is not None:
+        turn_x, turn_y = cx * w_xy - cy * w_xx, cx * w_yy - cy * w_xy  # phi'' with x'' and y''
+        links = (w_xx, w_xy, turn_x, w_yy, turn_y, cx * turn_y - cy * turn_x)
     matrix = tuple(
         jnp.sum(part, axis=0) if own is None else own + jnp.sum(part, axis=0)
         for own, part in zip(platform.matrix, links, strict=True)
@@ -390,17 +397,24 @@ def _pose_acceleration(
     force_f = joint.ff * rates[0] + joint.fg * rates[1] + joint.load_f
     force_g = joint.fg * rates[0] + joint.gg * rates[1] + joint.load_g
     force_x, force_y = y * force_g - x * force_f, -(y * force_f + x * force_g)  # on the platform
-    load = (
-        jnp.sum(force_x, axis=0),
-        jnp.sum(force_y, axis=0),
-        jnp.sum(cx * force_y - cy * force_x, axis=0),
-    )
+    load: tuple[Array, ...] = (jnp.sum(force_x, axis=0), jnp.sum(force_y, axis=0))
+    if cx is not None and cy is not None:
+        load = (*load, jnp.sum(cx * force_y - cy * force_x, axis=0))
     if platform.moment is not None:
         outward = (phi2 * platform.moment[0], phi2 * platform.moment[1])
         load = (load[0] + outward[0], load[1] + outward[1], load[2])
     if wrench is not None:
         load = tuple(own + wrench[k] for k, own in enumerate(load))
-    return solve_symmetric_3(matrix, load)
+    solve = solve_symmetric_2 if cx is None else solve_symmetric_3
+    return solve(matrix, load)
+
+
+def solve_symmetric_2(matrix: tuple[Array, ...], right: tuple[Array, ...]) -> Array:
+    """The same as `solve_symmetric_3` of a 2x2 system (m00, m01, m11), (2,)."""
+    m00, m01, m11 = matrix
+    l10 = m01 / m00
+    x1 = (right[1] - l10 * right[0]) / (m11 - l10 * m01)
+    return jnp.stack([right[0] / m00 - l10 * x1, x1])
 
 
 def solve_symmetric_3(matrix: tuple[Array, ...], right: tuple[Array, ...]) -> Array:
@@ -427,10 +441,11 @@ def solve_symmetric_3(matrix: tuple[Array, ...], right: tuple[Array, ...]) -> Ar
 
 
 def mass_matrix(platform: Platform) -> Array:
-    """M_p as a matrix [kg, kg m, kg m2], (3, 3)."""
+    """M_p as a matrix [kg, kg m, kg m2], (3, 3) or (2, 2)."""
     real = jnp.result_type(float)
     m = [jnp.asarray(0.0 if entry is None else entry, real) for entry in platform.matrix]
-    return jnp.stack([jnp.stack([m[j] for j in row]) for row in ((0, 1, 2), (1, 3, 4), (2, 4, 5))])
+    rows = ((0, 1), (1, 2)) if len(m) == 3 else ((0, 1, 2), (1, 3, 4), (2, 4, 5))
+    return jnp.stack([jnp.stack([m[j] for j in row]) for row in rows])
 
 
 def straight_motion(chain: Chain, pose_rate: Array, pose_acc: Array) -> tuple[Array, Array]:
@@ -441,10 +456,12 @@ def straight_motion(chain: Chain, pose_rate: Array, pose_acc: Array) -> tuple[Ar
         pose_rate: (3,).
         pose_acc: (3,).
     """
-    frame, phi2 = chain.frame, pose_rate[2] ** 2
+    frame = chain.frame
     acc_f, acc_g = frame.joint_motion(pose_acc)
-    acc_f = acc_f + chain.chord * chain.beta_rate**2 - phi2 * frame.c_f
-    acc_g = acc_g - phi2 * frame.c_g
+    acc_f = acc_f + chain.chord * chain.beta_rate**2
+    if frame.c_f is not None and frame.c_g is not None:
+        phi2 = pose_rate[2] ** 2
+        acc_f, acc_g = acc_f - phi2 * frame.c_f, acc_g - phi2 * frame.c_g
     if chain.turning is not None:
         acc_f, acc_g = acc_f - chain.sine * chain.turning, acc_g - chain.cosine * chain.turning
     return frame.link_motion(acc_f, acc_g)
@@ -478,7 +495,7 @@ def inverse_dynamics(
         (3,).
     """
     chain = close_chain(plant, pose, pose_rate)
-    frame, rate2, phi2 = chain.frame, chain.beta_rate**2, pose_rate[2] ** 2
+    frame, rate2 = chain.frame, chain.beta_rate**2
     rho_acc, beta_acc = straight_motion(chain, pose_rate, pose_acc)
     moment = plant.tip_mass * plant.length
     on_rho = plant.slider_link_mass * rho_acc - moment * (
@@ -488,11 +505,13 @@ def inverse_dynamics(
     if chain.turning is not None:
         on_beta = on_beta + moment * chain.cosine * chain.turning
     force_f, force_g = frame.joint_force(on_rho, on_beta)
-    to_f = jnp.stack([frame.x, frame.y, -frame.c_g])
-    to_g = jnp.stack([-frame.y, frame.x, frame.c_f])
+    to_f, to_g = jnp.stack([frame.x, frame.y]), jnp.stack([-frame.y, frame.x])
+    if frame.c_f is not None and frame.c_g is not None:
+        to_f, to_g = jnp.stack([*to_f, -frame.c_g]), jnp.stack([*to_g, frame.c_f])
     platform = platform_mass(plant, chain.turn)
     load = jnp.sum(to_f * force_f + to_g * force_g, axis=1) + mass_matrix(platform) @ pose_acc
     if platform.moment is not None:
+        phi2 = pose_rate[2] ** 2
         load = load - phi2 * jnp.stack([*platform.moment, jnp.zeros_like(phi2)])
     load = load if wrench is None else load - wrench
     return jnp.linalg.solve(frame.rho_f * to_f, load)
@@ -527,10 +546,9 @@ def kinetic_energy(plant: Plant, chain: Chain, pose_rate: Array, q: Array, q_rat
         - chain.rho_rate * chain.beta_rate * swing
         - chain.rho_rate * push
     )
-    platform = (
-        plant.platform_mass * (pose_rate[0] ** 2 + pose_rate[1] ** 2)
-        + plant.platform_inertia * pose_rate[2] ** 2
-    ) / 2
+    platform = plant.platform_mass * (pose_rate[0] ** 2 + pose_rate[1] ** 2) / 2
+    if chain.turn is not None:
+        platform = platform + plant.platform_inertia * pose_rate[2] ** 2 / 2
     moment = platform_mass(plant, chain.turn).moment
     if moment is not None:
         across = moment[0] * pose_rate[1] - moment[1] * pose_rate[0]

@@ -46,8 +46,8 @@ class Frame(NamedTuple):
 
     x: Array  # direction of f in the plane [1]
     y: Array
-    c_f: Array  # C - X along f [m]
-    c_g: Array
+    c_f: Array | None  # C - X along f [m]; None: the platform is a point
+    c_g: Array | None
     rho_f: Array  # [1]
     rho_g: Array | None  # None: zero
     beta_f: Array  # [1/m]
@@ -69,11 +69,12 @@ class Frame(NamedTuple):
 
     def joint_motion(self, pose_rate: Array) -> tuple[Array, Array]:
         """Velocity of C along f and g from that of the pose (accelerations without phi'^2)."""
-        x_rate, y_rate, turn = pose_rate[0], pose_rate[1], pose_rate[2]
-        return (
-            self.x * x_rate + self.y * y_rate - self.c_g * turn,
-            self.x * y_rate - self.y * x_rate + self.c_f * turn,
-        )
+        x_rate, y_rate = pose_rate[0], pose_rate[1]
+        along_f = self.x * x_rate + self.y * y_rate
+        along_g = self.x * y_rate - self.y * x_rate
+        if self.c_f is None or self.c_g is None:
+            return along_f, along_g
+        return along_f - self.c_g * pose_rate[2], along_g + self.c_f * pose_rate[2]
 
 
 class Chain(NamedTuple):
@@ -81,10 +82,11 @@ class Chain(NamedTuple):
 
     bend: Bend
     frame: Frame
-    turn: tuple[Array, Array]  # sin and cos of phi [1], () each
-    cx: Array  # C - X in the plane [m]
-    cy: Array
+    turn: tuple[Array, Array] | None  # sin and cos of phi [1], () each; None: it is a point
+    cx: Array | None  # C - X in the plane [m]
+    cy: Array | None
     near: Near  # joints B
+    far: tuple[Array, Array]  # joints C in the plane [m]
     chord: Array  # c [m]
     sine: Array  # sin gamma [1]
     cosine: Array  # cos gamma [1]
@@ -111,10 +113,12 @@ def close_chain(plant: Plant, pose: Array, pose_rate: Array, bend: Bend | None =
         finite there but meaningless: see `chain_status`.
     """
     bend = Bend() if bend is None else bend
-    sine, cosine = sine_cosine(pose[2])
-    cx = plant.joint_cos * cosine - plant.joint_sin * sine
-    cy = plant.joint_sin * cosine + plant.joint_cos * sine
-    x, y = pose[0] + cx, pose[1] + cy
+    x, y, cx, cy, turn = pose[0], pose[1], None, None, None
+    if plant.joint_cos is not None and plant.joint_sin is not None:
+        turn = sine, cosine = sine_cosine(pose[2])
+        cx = plant.joint_cos * cosine - plant.joint_sin * sine
+        cy = plant.joint_sin * cosine + plant.joint_cos * sine
+        x, y = x + cx, y + cy
     chord = plant.length if bend.shortening is None else plant.length - bend.shortening
     squared = chord * chord
     if bend.tip is not None:
@@ -134,7 +138,8 @@ def close_chain(plant: Plant, pose: Array, pose_rate: Array, bend: Bend | None =
         f_u, f_n = sin_gamma, -cos_gamma
         ways = tuple(inverse * x for x in (-bend.tip, chord, -cos_gamma, sin_gamma))
     f_x, f_y = near.x * f_u - near.y * f_n, near.y * f_u + near.x * f_n
-    frame = Frame(f_x, f_y, f_x * cx + f_y * cy, f_x * cy - f_y * cx, *ways)
+    c_f, c_g = (None, None) if cx is None else (f_x * cx + f_y * cy, f_x * cy - f_y * cx)
+    frame = Frame(f_x, f_y, c_f, c_g, *ways)
     along_f, along_g = frame.joint_motion(pose_rate)
     for rate in (bend.tip_rate, bend.shortening_rate):
         along_f = along_f if rate is None else along_f + rate
@@ -142,10 +147,11 @@ def close_chain(plant: Plant, pose: Array, pose_rate: Array, bend: Bend | None =
     return Chain(
         bend=bend,
         frame=frame,
-        turn=(sine, cosine),
+        turn=turn,
         cx=cx,
         cy=cy,
         near=near,
+        far=(x, y),
         chord=chord,
         sine=sin_gamma,
         cosine=cos_gamma,
@@ -205,15 +211,18 @@ def singularity_distance(plant: Plant, pose: Array) -> Array:
 def hold(chain: Chain) -> Array:
     """How firmly links of given length hold the platform [1], (): from 0, not at all, to 1.
 
-    Three links whose lines meet in one point, or are parallel, let the platform turn about that
-    point. |det| of their directions and moments about the centre of the joints, over its largest
-    value; near 0 it is the angle [rad] by which the lines miss.
+    A point is held by the sine of the angle between two links. Three links whose lines meet in one
+    point, or are parallel, let the platform turn about that point. |det| of their directions and
+    moments about the centre of the joints, over its largest value; near 0 it is the angle [rad] by
+    which the lines miss.
 
     Args:
         chain: of straight links.
     """
     frame = chain.frame
     x, y = frame.x, frame.y
+    if chain.cx is None or chain.cy is None:
+        return jnp.abs(x[0] * y[1] - y[0] * x[1])
     from_x, from_y = (c - jnp.mean(c, axis=0) for c in (chain.cx, chain.cy))
     arm = x * from_y - y * from_x
     size = jnp.mean(jnp.sqrt(jnp.maximum(from_x**2 + from_y**2, TINY_AREA)), axis=0)
@@ -231,8 +240,8 @@ def over_poses(plant: Plant, axes: int) -> Plant:
 
     return plant._replace(
         legs=jax.tree.map(wide, plant.legs),
-        joint_cos=wide(plant.joint_cos),
-        joint_sin=wide(plant.joint_sin),
+        joint_cos=None if plant.joint_cos is None else wide(plant.joint_cos),
+        joint_sin=None if plant.joint_sin is None else wide(plant.joint_sin),
         length=wide(plant.length),
     )
 

@@ -20,8 +20,8 @@ class Plant(NamedTuple):
     """Machine and modal basis in the form the equations of motion use (shapes as above)."""
 
     legs: Legs  # paths of the near joints
-    joint_cos: Array  # |PC| cos(psi) [m], (3,)
-    joint_sin: Array  # |PC| sin(psi) [m], (3,)
+    joint_cos: Array | None  # |PC| cos(psi) [m], (n,); None: the platform is a point
+    joint_sin: Array | None  # |PC| sin(psi) [m], (n,)
     length: Array  # L [m], (3,)
     # rigid inertia
     slider_link_mass: Array  # m_b + m_s [kg], (3,)
@@ -80,10 +80,11 @@ def build_plant(
         Plant.
     """
     geometry, masses, beam = machine.geometry, machine.masses, machine.beam
-    psi = jnp.asarray(geometry.joint_angle)
+    legs, arms = geometry.legs(), geometry.arms()
+    count = basis.mass.shape[:1]
 
     def link(x: Array) -> Array:
-        return jnp.broadcast_to(jnp.asarray(x), (3,))
+        return jnp.broadcast_to(jnp.asarray(x), count)
 
     length = link(beam.length)
     payload, offset = jnp.asarray(masses.payload_mass), masses.payload_offset
@@ -92,9 +93,9 @@ def build_plant(
     if offset is not None:
         inertia = inertia + payload * jnp.sum(jnp.asarray(offset) ** 2)
     return Plant(
-        legs=geometry.legs(),
-        joint_cos=link(geometry.joint_radius) * jnp.cos(psi),
-        joint_sin=link(geometry.joint_radius) * jnp.sin(psi),
+        legs=legs,
+        joint_cos=None if arms is None else arms[0],
+        joint_sin=None if arms is None else arms[1],
         length=length,
         slider_link_mass=link(masses.slider_mass)
         + basis.link_mass

@@ -8,6 +8,7 @@ import pytest
 
 from jaxmodel import kinematics, status
 from jaxmodel.beam import build_basis
+from jaxmodel.mechanisms.five_bar.geometry import Geometry as FiveBar
 from jaxmodel.mechanisms.prrr.paper import paper_machine
 from jaxmodel.mechanisms.rrr.cranks import Geometry
 from jaxmodel.plant import build_plant
@@ -34,6 +35,19 @@ MACHINES = {
     "rrr": paper_machine()._replace(geometry=CRANKS),
     "rrr unequal": paper_machine()._replace(geometry=UNEQUAL),
 }
+PAPER = paper_machine()
+MACHINES["five-bar"] = PAPER._replace(
+    geometry=FiveBar(
+        pivot_distance=0.2,
+        crank_length=np.array([0.15, 0.16]),
+        elbow=np.array([-1.0, 1.0]),
+        zero_angle=np.radians([120.0, 60.0]),
+    ),
+    patches=PAPER.patches._replace(center=PAPER.patches.center[:2]),
+    damping=PAPER.damping._replace(ratio=np.full((2, 1), 0.01), count=np.ones(2, int)),
+)
+#: Where the random poses are, and how far they are from there.
+PLACES = {3: (np.zeros(3), np.array([0.02, 0.02, 0.1])), 2: (np.array([0.0, 0.24]), 0.02)}
 KINDS = [
     ("pinned_pinned", "lumped"),
     ("pinned_pinned", "distributed"),
@@ -59,13 +73,14 @@ def make(kind, machine, shortening):
     return made
 
 
-@pytest.fixture(scope="module")
-def states():
+def states(machine):
     """Random states far from rest."""
-    rng, count = np.random.default_rng(7), (N_STATES, 3)
+    n = len(machine.patches.center)
+    rng, count = np.random.default_rng(7), (N_STATES, n)
+    center, size = PLACES[n]
     motion = reference.RigidState(
-        pose=np.array([0.02, 0.02, 0.1]) * rng.uniform(-1, 1, size=count),
-        pose_rate=rng.normal(size=count) * [0.3, 0.3, 1.0],
+        pose=center + size * rng.uniform(-1, 1, size=count),
+        pose_rate=rng.normal(size=count) * np.array([0.3, 0.3, 1.0])[:n],
         q=3e-3 * rng.uniform(-1, 1, size=(*count, R)) / np.arange(1, R + 1),
         q_rate=0.5 * rng.normal(size=(*count, R)),
     )
@@ -86,11 +101,11 @@ def all_forms(machine, basis, plant, motion, loads):
 
 @pytest.mark.parametrize("name", MACHINES)
 @pytest.mark.parametrize(("kind", "shortening"), KINDS)
-def test_accelerations_equal_lagrangian_and_multiplier_form(name, kind, shortening, states):
+def test_accelerations_equal_lagrangian_and_multiplier_form(name, kind, shortening):
     machine = MACHINES[name]
     basis, plant = make(kind, machine, shortening)
     (chain, found), (pose_l, q_l), (pose_m, q_m, rho_m, beta_m) = all_forms(
-        machine, basis, plant, *states
+        machine, basis, plant, *states(machine)
     )
     assert np.all(jax.vmap(partial(kinematics.chain_status, plant))(chain) == status.OK)
     pairs = (

@@ -52,6 +52,23 @@ class Legs(Protocol):
         """
 
 
+class Geometry(Protocol):
+    """Numbers that describe a mechanism: a NamedTuple of arrays."""
+
+    def legs(self) -> Legs:
+        """Paths of the near joints."""
+
+    def arms(self) -> tuple[Array, Array] | None:
+        """Far joints in the platform's axes [m], (n,) each; None: the platform is a point."""
+
+
+def polar(radius: Array, angle: Array) -> tuple[Array, Array]:
+    """Points by their distance [m], () or (n,), and direction [rad], (n,)."""
+    angle = jnp.asarray(angle)
+    radius = jnp.broadcast_to(jnp.asarray(radius), angle.shape)
+    return radius * jnp.cos(angle), radius * jnp.sin(angle)
+
+
 def safe_root(squared: Array, floor: Array) -> Array:
     """Root of a number that may be negative where nothing depends on it."""
     return jnp.sqrt(jnp.maximum(squared, floor))

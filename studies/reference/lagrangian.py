@@ -16,8 +16,8 @@ import numpy as np
 from jaxmodel.beam import ModalBasis
 from jaxmodel.dynamics import Accelerations, accelerations, modal_chain
 from jaxmodel.kinematics import Chain
+from jaxmodel.mechanisms.five_bar import geometry as five_bar
 from jaxmodel.mechanisms.prrr import guides as prrr
-from jaxmodel.mechanisms.rrr import cranks as rrr
 from jaxmodel.parameters import Machine
 from jaxmodel.plant import Plant
 
@@ -47,8 +47,10 @@ def guides(geometry: prrr.Geometry) -> tuple[jax.Array, jax.Array, jax.Array]:
     return -away[:, None] * n - geometry.guide_side / 2 * u, u, n
 
 
-def pivots(geometry: rrr.Geometry) -> jax.Array:
+def pivots(geometry: Any) -> jax.Array:
     """A_i of the cranks [m], (n, 2)."""
+    if isinstance(geometry, five_bar.Geometry):
+        return jnp.array([[-0.5, 0.0], [0.5, 0.0]]) * geometry.pivot_distance
     angle = geometry.pivot_angle
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1) * jnp.reshape(
         geometry.pivot_radius, (-1, 1)
@@ -81,7 +83,9 @@ def reach(geometry: Any, joints: Any, distance: Any) -> Any:
 
 
 def platform_joints(geometry: Any, pose: jax.Array) -> jax.Array:
-    """Joints C_i [m] of the platform, (3, 2)."""
+    """Joints C_i [m] of the platform, (n, 2)."""
+    if isinstance(geometry, five_bar.Geometry):
+        return jnp.stack([pose, pose])
     angle = geometry.joint_angle + pose[2]
     radius = jnp.broadcast_to(geometry.joint_radius, (3,))
     return pose[:2] + radius[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
@@ -102,12 +106,12 @@ def payload_energy(masses: Any, pose: jax.Array, pose_rate: jax.Array) -> Any:
 
 def tip_deflection(basis: ModalBasis, q: jax.Array) -> Any:
     """w = sum Y_j(L) q_j [m], (3,)."""
-    return jnp.zeros(3) if basis.tip is None else jnp.sum(basis.tip * q, axis=1)
+    return jnp.zeros(len(q)) if basis.tip is None else jnp.sum(basis.tip * q, axis=1)
 
 
 def chord_length(machine: Machine, basis: ModalBasis, q: jax.Array) -> Any:
     """c = L - 1/2 q^t S q [m], (3,): a bent link's ends are closer."""
-    length = jnp.broadcast_to(machine.beam.length, (3,))
+    length = jnp.broadcast_to(machine.beam.length, (len(q),))
     if basis.shortening is None:
         return length
     slopes = jax.vmap(jnp.diag)(jnp.asarray(basis.shortening))
@@ -119,7 +123,7 @@ def chord_length(machine: Machine, basis: ModalBasis, q: jax.Array) -> Any:
 def first_moment(machine: Machine, basis: ModalBasis, q: jax.Array) -> Any:
     """int rhoA (x - s) dx [kg m], (3,), s(x) the inward motion; lumped, C's share of it alone."""
     if basis.inward is None:
-        length = jnp.broadcast_to(machine.beam.length, (3,))
+        length = jnp.broadcast_to(machine.beam.length, (len(q),))
         return basis.first_moment / length * chord_length(machine, basis, q)
     return basis.first_moment - jnp.einsum("ij,ijk,ik->i", q, basis.inward, q) / 2
 
@@ -183,6 +187,8 @@ def kinetic_energy(
     )
     masses = machine.masses
     platform = masses.platform_mass * jnp.sum(pose_rate[:2] ** 2)
+    if len(pose) == 2:  # a point
+        return (jnp.sum(links) + platform) / 2
     platform = platform + masses.platform_inertia * pose_rate[2] ** 2
     return (jnp.sum(links) + platform) / 2 + payload_energy(masses, pose, pose_rate)
 
@@ -219,33 +225,34 @@ def closed_form(plant: Plant, motion: RigidState, loads: Loads) -> tuple[Chain, 
 
 def by_lagrangian(machine: Machine, basis: ModalBasis, motion: RigidState, loads: Loads) -> Any:
     """Accelerations (X'' (3,), q'' (3, R)) from the Lagrangian in (X, q)."""
-    shape = motion.q.shape
+    shape, n = motion.q.shape, len(motion.pose)
 
     def split(z: Any) -> Any:
-        return z[:3], z[3:].reshape(shape)
+        return z[:n], z[n:].reshape(shape)
 
     def joint_coordinates(z: Any) -> Any:
         return close(machine, basis, *split(z))
 
     def energy(z: Any, z_rate: Any) -> Any:
+        (pose, q), (pose_rate, q_rate) = split(z), split(z_rate)
         joints, rates = jax.jvp(joint_coordinates, (z,), (z_rate,))
-        return kinetic_energy(machine, basis, joints, *split(z), rates, *split(z_rate))
+        return kinetic_energy(machine, basis, joints, pose, q, rates, pose_rate, q_rate)
 
     z = jnp.concatenate([motion.pose, motion.q.ravel()])
     z_rate = jnp.concatenate([motion.pose_rate, motion.q_rate.ravel()])
     mass, inertial = inertia(energy, z, z_rate)
     on_modes = modal_load(machine, basis, motion.q, motion.q_rate, loads.modal)
-    load = jnp.concatenate([jnp.zeros(3), on_modes.ravel()])
+    load = jnp.concatenate([jnp.zeros(n), on_modes.ravel()])
     load = load + jax.jacfwd(lambda z: joint_coordinates(z)[0])(z).T @ loads.slider
     return split(jnp.linalg.solve(mass, load - inertial))
 
 
 def by_multipliers(machine: Machine, basis: ModalBasis, motion: RigidState, loads: Loads) -> Any:
     """(X'', q'', rho'', beta'') from (5): coordinates (rho, beta, X, q), constraints (6)."""
-    shape = motion.q.shape
+    shape, n = motion.q.shape, len(motion.pose)
 
     def split(y: Any) -> Any:
-        return y[:3], y[3:6], y[6:9], y[9:].reshape(shape)
+        return y[:n], y[n : 2 * n], y[2 * n : 3 * n], y[3 * n :].reshape(shape)
 
     def constraints(y: Any) -> Any:
         rho, beta, pose, q = split(y)
@@ -254,8 +261,9 @@ def by_multipliers(machine: Machine, basis: ModalBasis, motion: RigidState, load
 
     def energy(y: Any, y_rate: Any) -> Any:
         rho, beta, pose, q = split(y)
-        rho_rate, beta_rate, *rates = split(y_rate)
-        return kinetic_energy(machine, basis, (rho, beta), pose, q, (rho_rate, beta_rate), *rates)
+        rho_rate, beta_rate, pose_rate, q_rate = split(y_rate)
+        joints, rates = (rho, beta), (rho_rate, beta_rate)
+        return kinetic_energy(machine, basis, joints, pose, q, rates, pose_rate, q_rate)
 
     def all_coordinates(z: Any) -> Any:
         pose, q = z
@@ -266,10 +274,10 @@ def by_multipliers(machine: Machine, basis: ModalBasis, motion: RigidState, load
     )
     mass, inertial = inertia(energy, y, y_rate)
     on_modes = modal_load(machine, basis, motion.q, motion.q_rate, loads.modal)
-    load = jnp.concatenate([loads.slider, jnp.zeros(6), on_modes.ravel()])
+    load = jnp.concatenate([loads.slider, jnp.zeros(2 * n), on_modes.ravel()])
     jacobian = jax.jacfwd(constraints)(y)
     curvature = jax.jvp(lambda y: jax.jvp(constraints, (y,), (y_rate,))[1], (y,), (y_rate,))[1]
-    system = jnp.block([[mass, jacobian.T], [jacobian, jnp.zeros((6, 6))]])
+    system = jnp.block([[mass, jacobian.T], [jacobian, jnp.zeros((2 * n, 2 * n))]])
     solution = jnp.linalg.solve(system, jnp.concatenate([load - inertial, -curvature]))
     rho_acc, beta_acc, pose_acc, q_acc = split(solution[: y.size])
     return pose_acc, q_acc, rho_acc, beta_acc

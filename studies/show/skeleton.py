@@ -67,7 +67,7 @@ def _positions(
 
     def one(pose: Array, q: Array) -> tuple[Array, Array, Array]:
         chain = modal_chain(plant, pose, jnp.zeros_like(pose), q, jnp.zeros_like(q))
-        joint = pose[:2] + jnp.stack([chain.cx, chain.cy], axis=1)
+        joint = jnp.stack(chain.far, axis=1)
         slider = joint - jnp.stack(chain.near.to_far(), axis=1)
         chord = joint - slider
         across = jnp.stack([-chord[:, 1], chord[:, 0]], axis=1) / plant.length[:, None]

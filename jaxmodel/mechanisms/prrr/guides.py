@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.lazy import jnp
-from jaxmodel.mechanisms.contract import Near, safe_root
+from jaxmodel.mechanisms.contract import Near, polar, safe_root
 from jaxmodel.parameters import Array
 
 #: Body angles psi [rad] of the platform joints for the two assemblies that fit the paper's text.
@@ -46,6 +46,10 @@ class Geometry(NamedTuple):
     joint_radius: Array  # distance platform centre - C_i [m], () or (3,)
     joint_angle: Array  # psi, body angle of C_i [rad], (3,)
     guide_offset: Array = 0.0  # how much further from O than the side a guide lies [m], () or (3,)
+
+    def arms(self) -> tuple[Array, Array]:
+        """Joints C_i in the platform's axes."""
+        return polar(self.joint_radius, self.joint_angle)
 
     def legs(self) -> Guides:
         """A_i = -r_i n_i - (a/2) u_i, r_i = a/(2 sqrt 3) + the guide's offset."""

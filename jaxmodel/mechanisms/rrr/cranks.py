@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from jaxmodel.lazy import jnp
-from jaxmodel.mechanisms.contract import Near, safe_root
+from jaxmodel.mechanisms.contract import Near, polar, safe_root
 from jaxmodel.parameters import Array
 
 #: Keeps a far joint from being on a pivot [m2].
@@ -66,16 +66,21 @@ class Geometry(NamedTuple):
     joint_radius: Array  # distance platform centre - C_i [m], () or (n,)
     joint_angle: Array  # body angle of C_i [rad], (n,)
 
+    def arms(self) -> tuple[Array, Array]:
+        """Joints C_i in the platform's axes."""
+        return polar(self.joint_radius, self.joint_angle)
+
     def legs(self) -> Cranks:
         """A_i = r_i (cos, sin) of the pivot's direction."""
-        pivot, zero = jnp.asarray(self.pivot_angle), jnp.asarray(self.zero_angle)
+        zero = jnp.asarray(self.zero_angle)
+        x, y = polar(self.pivot_radius, self.pivot_angle)
 
         def link(x: Array) -> Array:
-            return jnp.broadcast_to(jnp.asarray(x), pivot.shape)
+            return jnp.broadcast_to(jnp.asarray(x), zero.shape)
 
         return Cranks(
-            x=self.pivot_radius * jnp.cos(pivot),
-            y=self.pivot_radius * jnp.sin(pivot),
+            x=x,
+            y=y,
             length=link(self.crank_length),
             elbow=link(self.elbow),
             zero_x=jnp.cos(zero),
