@@ -11,7 +11,7 @@ from jaxmodel.beam import ModalBasis
 from jaxmodel.dynamics import accelerations, inverse_dynamics, straight_motion
 from jaxmodel.kinematics import Chain, close_chain
 from jaxmodel.lazy import jax, jnp
-from jaxmodel.parameters import Array, Beam
+from jaxmodel.parameters import Array, Machine
 from jaxmodel.piezo import bare_stiffness
 from jaxmodel.plant import Plant, shortening_matrix, unlumped
 
@@ -25,7 +25,7 @@ def critical_force(plant: Plant) -> Array:
     Infinite where the chord keeps its length.
     """
     if plant.shortening is None:
-        return jnp.full((3,), jnp.inf)
+        return jnp.full(plant.length.shape, jnp.inf)
     if plant.mixed_shortening is None:
         return jnp.min(plant.stiffness / plant.shortening, axis=1)
     scale = 1 / jnp.sqrt(plant.stiffness)
@@ -40,10 +40,11 @@ def critical_force(plant: Plant) -> Array:
     return 1 / jnp.trace(power @ softness, axis1=1, axis2=2)
 
 
-def euler_force(beam: Beam) -> Array:
-    """N_cr of the bare links, pi^2 E I/L^2 [N], (3,): a bound if the model has no buckling."""
+def euler_force(machine: Machine) -> Array:
+    """N_cr of the bare links, pi^2 E I/L^2 [N], (n,): a bound if the model has no buckling."""
+    beam = machine.beam
     force = jnp.pi**2 * bare_stiffness(beam) * beam.stiffness_factor / beam.length**2
-    return jnp.broadcast_to(jnp.asarray(force), (3,))
+    return jnp.broadcast_to(jnp.asarray(force), (machine.n_links,))
 
 
 def loaded_frequency(plant: Plant, axial: Array) -> Array:
@@ -122,7 +123,7 @@ def lumping_error(
     """
     left_out = None if plant.shortening is None else unlumped(basis, plant.length)
     if left_out is None or basis.centrifugal is None:
-        return jnp.zeros(3)
+        return jnp.zeros_like(plant.length)
     chain = close_chain(plant, pose, pose_rate)
     slide = chain.cosine * straight_motion(chain, pose_rate, pose_acc)[0]
     if chain.turning is not None:
@@ -134,10 +135,11 @@ def lumping_error(
     return jnp.max(jnp.abs(force) / plant.stiffness, axis=1)
 
 
-def axial_compliance(beam: Beam) -> Array:
-    """L/(E A) of the bare links [m/N], (3,)."""
+def axial_compliance(machine: Machine) -> Array:
+    """L/(E A) of the bare links [m/N], (n,)."""
+    beam = machine.beam
     section = jnp.asarray(beam.youngs_modulus) * beam.width * beam.thickness
-    return jnp.broadcast_to(beam.length / section, (3,))
+    return jnp.broadcast_to(beam.length / section, (machine.n_links,))
 
 
 def stretch_error(chain: Chain, stretch: Array) -> Array:

@@ -33,7 +33,7 @@ def find_bases(structure: Structure, case: Case) -> Bases:
     beam, patches, n = case.machine.beam, case.machine.patches, structure.n_controlled
     belief = beam._replace(stiffness_factor=1.0)
     size = max(structure.n_modes, n)
-    load = jnp.broadcast_to(case.initial.load_station, (3, 1))
+    load = jnp.broadcast_to(case.initial.load_station, (case.machine.n_links, 1))
     stations = jnp.concatenate([station_places(case), load], axis=1)
     both = structure.basis, structure.controller_basis
     if both[0] == both[1]:
@@ -56,7 +56,7 @@ def find_bases(structure: Structure, case: Case) -> Bases:
 
 def station_places(case: Case) -> Array:
     """Where the chord deflection of each link is taken, from the slider joint [m], (3, S)."""
-    length = jnp.broadcast_to(case.machine.beam.length, (3,))
+    length = jnp.broadcast_to(case.machine.beam.length, (case.machine.n_links,))
     return length[:, None] * case.windows.stations
 
 
@@ -76,12 +76,15 @@ def _side_by_side(
     Two eigenvalue problems in one program occasionally hang on CPUs (jax 0.10): XLA loses the
     second.
     """
-    pairs = zip(one, other, strict=True)
-    beam = Beam(*(jnp.concatenate([jnp.broadcast_to(x, (3,)) for x in pair]) for pair in pairs))
+    pairs, count = zip(one, other, strict=True), len(stations)
+    beam = Beam(*(jnp.concatenate([jnp.broadcast_to(x, (count,)) for x in pair]) for pair in pairs))
     twice = (jnp.asarray(x) for x in patches)
     both = Patches(*(jnp.concatenate([x, x]) if x.ndim else x for x in twice))
-    six = build_basis(kind, beam, both, size, jnp.tile(stations, (2, 1)))
-    return jax.tree.map(lambda x: x[:3], six), jax.tree.map(lambda x: x[3:], six)
+    joined = build_basis(kind, beam, both, size, jnp.tile(stations, (2, 1)))
+    return (
+        jax.tree.map(lambda x: x[:count], joined),
+        jax.tree.map(lambda x: x[count:], joined),
+    )
 
 
 def _first_modes(basis: ModalBasis, n_modes: int) -> ModalBasis:

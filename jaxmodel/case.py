@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from jaxmodel.lazy import jnp
+from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.motion import Path
 from jaxmodel.parameters import Array, Machine
 from jaxmodel.state_space import StateSpace
@@ -16,6 +17,7 @@ from jaxmodel.state_space import StateSpace
 class Structure(NamedTuple):
     """Static and hashable: array sizes and the few choices that change the program."""
 
+    mechanism: str = "prrr"  # name in `jaxmodel.mechanisms.MECHANISMS`
     n_modes: int = 8  # R, plant modes per link (upper bound; `Case.n_modes` may be fewer)
     n_controlled: int = 3  # C, controlled modes per link (upper bound; `Control.n_active`)
     n_patches: int = 3  # K, patch pairs per link
@@ -45,6 +47,21 @@ class Structure(NamedTuple):
     metrics: tuple[str, ...] = ()  # to accumulate; (): all of them
     is_linear: bool = False  # mechanics to first order about rest at the last way-point
     is_smooth: bool = False  # for gradients: noise instead of rounding, limits with round corners
+
+    @property
+    def n_links(self) -> int:
+        """Flexible links, each with an actuated joint."""
+        return MECHANISMS[self.mechanism].n_links
+
+    @property
+    def n_pose(self) -> int:
+        """Coordinates of the platform."""
+        return MECHANISMS[self.mechanism].n_pose
+
+    @property
+    def n_sensors(self) -> int:
+        """Patch pairs of the machine."""
+        return self.n_links * self.n_patches
 
     @property
     def is_delayed(self) -> bool:

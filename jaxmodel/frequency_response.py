@@ -133,7 +133,8 @@ def plant_response(structure: Structure, case: Case, loop: Loop, pose: Array) ->
     if not structure.is_coupled:
         enter = jnp.zeros_like(enter)
     left_out, n = loop.left_out, structure.n_patches
-    shape = (3, deflection.shape[1], n)
+    shape = (len(deflection), deflection.shape[1], n)
+    direct = jnp.zeros((len(deflection), n, n), mass.dtype)
     return PlantResponse(
         mass=mass,
         damping=jnp.einsum("i,ip,iq->pq", slope, to_rho, to_rho),
@@ -144,7 +145,7 @@ def plant_response(structure: Structure, case: Case, loop: Loop, pose: Array) ->
         leave=leave,
         sensor=sensor,
         actuator=actuator,
-        direct=jnp.zeros((3, n, n), mass.dtype) if left_out is None else left_out.sensor,
+        direct=direct if left_out is None else left_out.sensor,
         deflection=deflection,
         direct_deflection=jnp.zeros(shape, mass.dtype) if left_out is None else left_out.deflection,
         slide=to_rho,
@@ -296,7 +297,11 @@ def plant_images(plant: PlantResponse, omega: Array, order: np.ndarray) -> Image
 
 
 def _inverse(matrix: Array) -> Array:
-    """Of matrices (..., 3, 3)."""
+    """Of matrices (..., n, n), n = 2 or 3."""
+    if matrix.shape[-1] == 2:
+        (a, b), (c, d) = ((matrix[..., i, j] for j in range(2)) for i in range(2))
+        turned = jnp.stack([jnp.stack([d, -b], axis=-1), jnp.stack([-c, a], axis=-1)], axis=-2)
+        return turned / (a * d - b * c)[..., None, None]
     rows = [matrix[..., k, :] for k in range(3)]
     columns = [jnp.cross(rows[k - 2], rows[k - 1]) for k in range(3)]
     determinant = jnp.sum(rows[0] * columns[0], axis=-1)
@@ -337,7 +342,7 @@ def controller_response(controller: Controller, z: Array) -> Array:
     """
     feedback, through = controller.feedback, controller.feedthrough
     notch = controller.notch
-    passed = jnp.ones((3,)) if notch is None else notch_response(notch, z)
+    passed = jnp.ones(len(through)) if notch is None else notch_response(notch, z)
     if isinstance(feedback, Channels):
         rate, value = responses(feedback.estimator, z)
         force = feedback.velocity_gain * rate

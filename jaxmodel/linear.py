@@ -42,10 +42,11 @@ def flatten(state: PlantState) -> Array:
     return jnp.concatenate([jnp.ravel(jnp.asarray(part)) for part in state[:4]])
 
 
-def unflatten(x: Array, n_modes: int) -> PlantState:
+def unflatten(x: Array, structure: Structure) -> PlantState:
     """Inverse of `flatten`."""
-    modes = jnp.reshape(x[6:], (2, 3, n_modes))
-    return PlantState(x[:3], x[3:6], *modes)
+    n = structure.n_pose
+    modes = jnp.reshape(x[2 * n :], (2, structure.n_links, structure.n_modes))
+    return PlantState(x[:n], x[n : 2 * n], *modes)
 
 
 class Moment(NamedTuple):
@@ -105,26 +106,29 @@ def linearise(
         reference = reference._replace(disturbance=held - drive_force, wrench=moment.wrench)
 
     def derivative(x: Array, voltage: Array, force: Array) -> Array:
-        at = unflatten(x, structure.n_modes)
+        at = unflatten(x, structure)
         pushed = reference._replace(disturbance=reference.disturbance + force)
-        rates = plant_rates(structure, loop, at, pushed, jnp.reshape(voltage, (3, -1)))
+        rates = plant_rates(
+            structure, loop, at, pushed, jnp.reshape(voltage, (structure.n_links, -1))
+        )
         moves = rates.acceleration
         return flatten(PlantState(at.pose_rate, moves.pose, at.q_rate, moves.modal))
 
     def slider(x: Array) -> Array:
-        at = unflatten(x, structure.n_modes)
+        at = unflatten(x, structure)
         if structure.is_coupled:
             moved = modal_chain(loop.plant, at.pose, at.pose_rate, at.q, at.q_rate)
         else:
             moved = close_chain(loop.plant, at.pose, at.pose_rate)
         return jnp.concatenate([moved.rho, moved.rho_rate])
 
-    n_voltages = 3 * structure.n_patches
+    n_links = structure.n_links
+    n_voltages = structure.n_sensors
     a, b_voltage, b_force = jax.jacfwd(derivative, (0, 1, 2))(
         rest, jnp.zeros((n_voltages,), rest.dtype), still
     )
-    direct_deflection = jnp.zeros((3 * loop.deflection_at.shape[1], n_voltages), rest.dtype)
-    direct_sensor = jnp.zeros((3 * loop.sensor.shape[1], n_voltages), rest.dtype)
+    direct_deflection = jnp.zeros((n_links * loop.deflection_at.shape[1], n_voltages), rest.dtype)
+    direct_sensor = jnp.zeros((n_links * loop.sensor.shape[1], n_voltages), rest.dtype)
     if loop.left_out is not None:
         direct_deflection = _diagonal(loop.left_out.deflection)
         direct_sensor = _diagonal(loop.left_out.sensor)
@@ -132,30 +136,32 @@ def linearise(
         state=a,
         voltage=b_voltage,
         force=b_force,
-        deflection=_rows(loop.deflection_at, structure.n_modes),
-        sensor=_rows(loop.sensor, structure.n_modes),
+        deflection=_rows(loop.deflection_at, structure),
+        sensor=_rows(loop.sensor, structure),
         direct_deflection=direct_deflection,
         direct_sensor=direct_sensor,
         slider=jax.jacfwd(slider)(rest) if is_held else None,
     )
 
 
-def _rows(matrix: Array, n_modes: int) -> Array:
+def _rows(matrix: Array, structure: Structure) -> Array:
     """Per-link outputs of q, (3, m, R), as rows over x."""
-    return jnp.pad(_diagonal(matrix), ((0, 0), (6, 3 * n_modes)))
+    rates = structure.n_links * structure.n_modes
+    return jnp.pad(_diagonal(matrix), ((0, 0), (2 * structure.n_pose, rates)))
 
 
 def _diagonal(matrix: Array) -> Array:
     """Blocks of the links, (3, m, n), on a diagonal, (3 m, 3 n)."""
-    m, n = matrix.shape[1:]
-    return jnp.einsum("imr,il->imlr", matrix, jnp.eye(3)).reshape(3 * m, 3 * n)
+    links, m, n = matrix.shape
+    return jnp.einsum("imr,il->imlr", matrix, jnp.eye(links)).reshape(links * m, links * n)
 
 
 def mechanical(plant: LinearPlant) -> Array:
     """A with rows and columns in the order (X, q, X', q'), (2 m, 2 m)."""
-    r3 = (plant.state.shape[0] - 6) // 2
-    position = np.r_[0:3, 6 : 6 + r3]
-    velocity = np.r_[3:6, 6 + r3 : 6 + 2 * r3]
+    pose = plant.force.shape[1]  # as many joints as coordinates of the pose
+    first, modes = 2 * pose, plant.state.shape[0] // 2 - pose
+    position = np.r_[0:pose, first : first + modes]
+    velocity = np.r_[pose:first, first + modes : first + 2 * modes]
     index = np.r_[position, velocity]
     return plant.state[np.ix_(index, index)]
 
@@ -172,10 +178,11 @@ def mass_and_stiffness(loop: Loop, pose: Array, plant: LinearPlant) -> tuple[Arr
         (M, K): [kg and mixed] and [N/m and mixed], symmetric, (m, m) with m = 3 + 3 R.
     """
     rest = jnp.zeros_like(loop.omega)
-    size = 3 + rest.size
+    count = len(pose)
+    size = count + rest.size
 
     def energy(rates: Array) -> Array:
-        pose_rate, q_rate = rates[:3], rates[3:].reshape(rest.shape)
+        pose_rate, q_rate = rates[:count], rates[count:].reshape(rest.shape)
         chain = modal_chain(loop.plant, pose, pose_rate, rest, q_rate)
         return kinetic_energy(loop.plant, chain, pose_rate, rest, q_rate)
 

@@ -78,4 +78,4 @@ def linear_residual(structure: Structure, case: Case, matrices: LoopMatrices) ->
     log_square = jnp.minimum(gramian.log_size, 100.0) + jnp.log(
         jnp.maximum(share, 1e-300) / samples
     )
-    return jnp.reshape(size * jnp.exp(log_square / 2), (3, -1))
+    return jnp.reshape(size * jnp.exp(log_square / 2), (structure.n_links, -1))

@@ -660,7 +660,12 @@ def initial_state(
     is_direct = is_sampled and loop.left_out is not None
     n_stations = loop.deflection_at.shape[1]
     sizes = metrics.Sizes(
-        n_stations, structure.n_modes, structure.n_controlled, structure.n_frequencies
+        n_stations=n_stations,
+        n_modes=structure.n_modes,
+        n_controlled=structure.n_controlled,
+        n_frequencies=structure.n_frequencies,
+        n_links=structure.n_links,
+        n_pose=structure.n_pose,
     )
     totals = metrics.zero_totals(sizes, q.dtype, structure.metrics)
     return State(

@@ -106,14 +106,16 @@ class Sizes(NamedTuple):
     n_modes: int
     n_controlled: int
     n_frequencies: int
+    n_links: int
+    n_pose: int
 
     @property
     def axes(self) -> dict[str, int]:
         """Length of every axis by name."""
         return {
-            "link": 3,
-            "pose_axis": 3,
-            "slider_axis": 3,
+            "link": self.n_links,
+            "pose_axis": self.n_pose,
+            "slider_axis": self.n_links,
             "station": self.n_stations,
             "mode": self.n_modes,
             "controlled_mode": self.n_controlled,
@@ -203,7 +205,7 @@ def is_real(value: Any) -> bool:
 
 def check_metric(metric: Metric) -> None:
     """Raise PartError for a metric with unknown axes."""
-    axes = Sizes(1, 1, 1, 1).axes
+    axes = Sizes(*(1,) * len(Sizes._fields)).axes
     for dims in (metric.dims, *(total.dims for total in metric.totals)):
         for name in dims:
             if name not in axes:

@@ -79,3 +79,8 @@ class Machine(NamedTuple):
     beam: Beam
     patches: Patches
     damping: Damping
+
+    @property
+    def n_links(self) -> int:
+        """Flexible links."""
+        return int(self.patches.center.shape[-2])

@@ -111,10 +111,11 @@ def placement_faults(patches: Patches, length: Array) -> tuple[Array, Array]:
         (is_off_link, is_overlapping), boolean scalars.
     """
     longer = jnp.maximum(patches.sensor_length, patches.actuator_length)
-    half = jnp.broadcast_to(longer / 2, (3,))[:, None]
     center = jnp.sort(jnp.asarray(patches.center), axis=-1)
+    count = center.shape[:1]
+    half = jnp.broadcast_to(longer / 2, count)[:, None]
     tolerance = 1e-12  # [m], so that patches that just touch are allowed in spite of rounding
-    end = jnp.broadcast_to(jnp.asarray(length), (3,))[:, None]
+    end = jnp.broadcast_to(jnp.asarray(length), count)[:, None]
     is_off = jnp.any(center - half < -tolerance) | jnp.any(center + half > end + tolerance)
     is_overlapping = jnp.any(jnp.diff(center, axis=-1) < 2 * half - tolerance)
     return is_off, is_overlapping

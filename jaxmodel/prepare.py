@@ -112,7 +112,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         modal_omega=design.modal_omega,
         rotation=(jnp.cos(angle), jnp.sin(angle)),
         drive=_each_slider(case.drive),
-        axial_compliance=axial_compliance(machine.beam),
+        axial_compliance=axial_compliance(machine),
         settling_band=jnp.asarray(case.windows.settling_band),
         left_out=_left_out(structure, case, basis, after),
         hysteresis=_hysteresis(structure, case),
@@ -237,7 +237,7 @@ def _each_slider(drive: Drive) -> Drive:
     """The drive with its numbers for each slider, (3,)."""
 
     def each(x: Array) -> Array:
-        return jnp.broadcast_to(jnp.asarray(x), (3,))
+        return jnp.broadcast_to(jnp.asarray(x), jnp.shape(drive.pulse_force))
 
     parameters = {name: each(x) for name, x in drive.parameters.items()}
     numbers = {name: each(getattr(drive, name)) for name in _PER_LINK_DRIVE}
@@ -263,8 +263,9 @@ def spectrum_frequencies(structure: Structure, bases: Bases) -> Array:
 
 def _constants(case: Case) -> tuple[Array, Array]:
     beam, patches = case.machine.beam, case.machine.patches
-    lambda_s = jnp.broadcast_to(sensor_constant(beam, patches), (3,))
-    return lambda_s, jnp.broadcast_to(actuator_constant(beam, patches), (3,))
+    count = (case.machine.n_links,)
+    lambda_s = jnp.broadcast_to(sensor_constant(beam, patches), count)
+    return lambda_s, jnp.broadcast_to(actuator_constant(beam, patches), count)
 
 
 def design_controller(structure: Structure, case: Case, bases: Bases) -> ControllerDesign:
@@ -290,7 +291,8 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
     seen, driven = sensor[:, :, :n], jnp.swapaxes(actuator[:, :n], 1, 2)
     # in one call: XLA's CPU compiler aborts on two side by side if C = 1 (jax 0.10)
     inverse = jax.vmap(left_inverse, (0, None))(jnp.concatenate([seen, driven]), mask)
-    observer, synthesizer = inverse[:3], jnp.swapaxes(inverse[3:], 1, 2)
+    links = structure.n_links
+    observer, synthesizer = inverse[:links], jnp.swapaxes(inverse[links:], 1, 2)
 
     nominal = NominalModel(
         observer=observer,
@@ -305,7 +307,8 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
     )
     law = LAWS[structure.law]
     feedback = law.design(structure, case, nominal)
-    check_feedback(law, feedback, n_channels(structure), structure.n_patches)
+    sizes = structure.n_links, n_channels(structure), structure.n_patches
+    check_feedback(law, feedback, *sizes)
     if isinstance(feedback, Channels) and not structure.has_position_gain:
         feedback = feedback._replace(position_gain=None)
     controller = Controller(
@@ -392,7 +395,7 @@ def _static_status(
     mode_step, zeta = (jnp.where(is_used, x, 0.0) for x in (mode_step, zeta))
     patches, windows, control = case.machine.patches, case.windows, case.control
     step = case.electronics.period / structure.substeps
-    length = jnp.broadcast_to(case.machine.beam.length, (3,))
+    length = jnp.broadcast_to(case.machine.beam.length, (structure.n_links,))
     is_off, is_overlapping = placement_faults(patches, length)
     checks = (
         (_is_ill_conditioned(structure, case, design), status.ILL_CONDITIONED),

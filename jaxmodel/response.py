@@ -63,8 +63,9 @@ def bench_plant(structure: Structure, case: Case, pose: Array) -> BenchPlant:
     def rho(at: Array) -> Array:
         return close_chain(loop.plant, at, still).rho
 
-    r3 = 3 * structure.n_modes
-    to_pose = jnp.pad(jnp.eye(3), ((0, 0), (0, 3 + 2 * r3)))
+    n = structure.n_pose
+    others = (0, 0), (0, n + 2 * structure.n_links * structure.n_modes)
+    to_pose = jnp.pad(jnp.eye(n), others)
     across, along = jax.jacfwd(partial(_point_rates, loop, station_places(case), pose))(still)
     gains = drive_gains(DRIVES[structure.drive], loop.drive)
     return BenchPlant(
@@ -74,9 +75,9 @@ def bench_plant(structure: Structure, case: Case, pose: Array) -> BenchPlant:
         hammer=_hammer(structure, loop, case, pose),
         sensor=plant.sensor,
         deflection=plant.deflection,
-        across=jnp.reshape(across, (-1, 3)) @ to_pose + plant.deflection,
-        along=jnp.reshape(along, (-1, 3)) @ to_pose,
-        slider=jnp.pad(jax.jacfwd(rho)(pose), ((0, 0), (0, 3 + 2 * r3))),
+        across=jnp.reshape(across, (-1, n)) @ to_pose + plant.deflection,
+        along=jnp.reshape(along, (-1, n)) @ to_pose,
+        slider=jnp.pad(jax.jacfwd(rho)(pose), others),
         pose=to_pose,
         actuator_to_sensor=plant.direct_sensor,
         actuator_to_deflection=plant.direct_deflection,
@@ -116,7 +117,8 @@ def _hammer(structure: Structure, loop: Loop, case: Case, pose: Array) -> Array:
         rates = plant_rates(open_loop, pushed, at, reference._replace(wrench=wrench), force)
         return flatten(PlantState(still, rates.acceleration.pose, zero, rates.acceleration.modal))
 
-    return jnp.reshape(jax.jacfwd(derivative)(jnp.zeros((3, count), pose.dtype)), (-1, 3 * count))
+    forces = jnp.zeros((structure.n_links, count), pose.dtype)
+    return jnp.reshape(jax.jacfwd(derivative)(forces), (-1, forces.size))
 
 
 def held_modes(structure: Structure, case: Case) -> tuple[Array, Array]:

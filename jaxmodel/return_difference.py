@@ -169,7 +169,7 @@ def controlled_first(response: LoopResponse, link_mask: np.ndarray, count: int) 
         rows = order[:most].reshape(most, *(1,) * (x.ndim - 2), order.shape[1])
         return np.take_along_axis(x, rows, axis=0)
 
-    links = {name: moved(getattr(response, name), 3) for name in _LINK_FIELDS}
+    links = {name: moved(getattr(response, name), len(link_mask)) for name in _LINK_FIELDS}
     channels = {
         name: jax.tree.map(lambda x: moved(x, count), getattr(response, name))
         for name in _CHANNEL_FIELDS
@@ -209,13 +209,13 @@ def assembled_modes(response: LoopResponse | PlantResponse) -> AssembledModes:
     stiffness = reduced(response.stiffness, jnp.ravel(response.square))
     damping = reduced(response.damping, jnp.ravel(response.decay))
     square, shape = jnp.linalg.eigh(stiffness)
-    n_modes = response.square.shape[1]
-    energy = shape * shape
-    links = jnp.sum(jnp.reshape(energy[3:], (3, n_modes, -1)), axis=0)
+    n_links, n_modes = response.square.shape
+    energy, pose = shape * shape, len(response.mass)
+    links = jnp.sum(jnp.reshape(energy[pose:], (n_links, n_modes, -1)), axis=0)
     return AssembledModes(
         jnp.sqrt(jnp.maximum(square, 0.0)),
         jnp.sum(shape * (damping @ shape), axis=0) / 2,
-        jnp.concatenate([jnp.sum(energy[:3], axis=0)[None], links]),
+        jnp.concatenate([jnp.sum(energy[:pose], axis=0)[None], links]),
         jnp.sqrt(jnp.maximum(-square[0], 0.0)),
     )
 

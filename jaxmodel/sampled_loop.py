@@ -95,7 +95,7 @@ def loop_matrices(
         filtered=analogue.filtered,
         exact=exact,
     )
-    no_reference = jnp.zeros((6,), analogue.state.dtype)
+    no_reference = jnp.zeros((2 * structure.n_links,), analogue.state.dtype)
     rest, unpack = step.rest()
     n = len(exact.held)
     start = jnp.concatenate([jnp.zeros((n,), analogue.state.dtype), rest])
@@ -138,7 +138,7 @@ class _Step(NamedTuple):
         """State of controller and drive at rest, and the function that unpacks such a state."""
         from jax.flatten_util import ravel_pytree
 
-        still = jnp.zeros((3,), self.exact.held.dtype)
+        still = jnp.zeros((self.structure.n_links,), self.exact.held.dtype)
         return ravel_pytree(
             (rest_controller(self.law), resting_drive(DRIVES[self.structure.drive], still))
         )
@@ -179,15 +179,16 @@ def _next_drive(
         return None
     assert plant.slider is not None
     seen, still = plant.slider @ x[: plant.slider.shape[1]], jnp.zeros_like(servo.force)
-    wanted = Reference(reference[:3], reference[3:], None, still)
+    n = structure.n_links
+    wanted = Reference(reference[:n], reference[n:], None, still)
     return drive_step(
         structure._replace(is_linear=True),
         loop.drive,
         case.electronics.period,
         servo,
         wanted,
-        seen[:3],
-        seen[3:],
+        seen[:n],
+        seen[n:],
         servo.force,
     )
 
@@ -237,9 +238,13 @@ def delayed_parts(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
     smooth, drive = structure._replace(has_delay=True, is_smooth=True), DRIVES[structure.drive]
     plant = linearise(smooth, loop, pose, resting(smooth, case), drive.is_sampled)
     analogue = analogue_plant(smooth, plant, case)
-    count, n_sensors, dtype = len(analogue.state), 3 * structure.n_patches, analogue.state.dtype
+    count, n_sensors, dtype = (
+        len(analogue.state),
+        structure.n_sensors,
+        analogue.state.dtype,
+    )
     below = jnp.pad(_queue(n_sensors, dtype), ((count, 0), (count, 0)))
-    unmoved = jnp.zeros((len(below), 3), dtype)
+    unmoved = jnp.zeros((len(below), structure.n_links), dtype)
     exact = _Sampled(held=below, newest=None, force=unmoved, present=unmoved)
     step = _Step(
         structure=smooth,
@@ -255,7 +260,7 @@ def delayed_parts(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
     places, servo = unpack(jnp.arange(n, n + rest.size, dtype=dtype))
     start = jnp.concatenate([jnp.zeros((n,), dtype), rest])
     return DelayedParts(
-        matrix=jax.jacfwd(step.advance)(start, 1.0, jnp.zeros((6,), dtype)),
+        matrix=jax.jacfwd(step.advance)(start, 1.0, jnp.zeros((2 * structure.n_links,), dtype)),
         state=analogue.state,
         enters=analogue.enters,
         commands=jnp.ravel(places.voltage).astype(int),
@@ -295,9 +300,9 @@ def sampled_plant(structure: Structure, case: Case, pose: Array) -> SampledPlant
     exact = _over_a_sample(smooth, analogue, case)
     from jax.flatten_util import ravel_pytree
 
-    n, n_sensors = len(exact.held), 3 * structure.n_patches
-    no_reference = jnp.zeros((6,), exact.held.dtype)
-    rest, unpack = ravel_pytree(resting_drive(drive, no_reference[:3]))
+    n, n_sensors = len(exact.held), structure.n_sensors
+    no_reference = jnp.zeros((2 * structure.n_links,), exact.held.dtype)
+    rest, unpack = ravel_pytree(resting_drive(drive, no_reference[: structure.n_links]))
     m = n + rest.size
     eye = jnp.eye(n_sensors, dtype=exact.held.dtype)
 
@@ -337,7 +342,7 @@ class _Sampled(NamedTuple):
 
 def _over_a_sample(structure: Structure, analogue: AnaloguePlant, case: Case) -> _Sampled:
     """Transition of plant and electronics from sample to sample."""
-    period, n_sensors = case.electronics.period, 3 * structure.n_patches
+    period, n_sensors = case.electronics.period, structure.n_sensors
     eye = jnp.eye(n_sensors, dtype=analogue.state.dtype)
     if not structure.has_delay:
         exact = _held_transition(analogue, period)
@@ -392,8 +397,12 @@ def analogue_plant(structure: Structure, plant: LinearPlant, case: Case) -> Anal
     are summed, and there are fewer sensors than modes.
     """
     electronics, n_plant = case.electronics, plant.state.shape[0]
-    n_sensors, n_modes = 3 * structure.n_patches, 3 * structure.n_modes
-    sizes = [(1.0, 3), (1e3, 3), (1.0, n_modes), (1e3, n_modes)]
+    n_sensors, n_modes = (
+        structure.n_sensors,
+        structure.n_links * structure.n_modes,
+    )
+    n_pose = structure.n_pose
+    sizes = [(1.0, n_pose), (1e3, n_pose), (1.0, n_modes), (1e3, n_modes)]
     blocks = {"z": 1e4, "z_rate": 1e7}
     if structure.has_sensor_highpass:
         blocks["s"] = 1e4
@@ -559,10 +568,11 @@ def spillover(structure: Structure, case: Case, matrices: LoopMatrices) -> Array
     on = jnp.asarray(control.link_mask)[:, None] * control.mode_mask
     on = on * (jnp.arange(n) < control.n_active)
     is_left = jnp.ravel(1.0 - jnp.pad(on, ((0, 0), (0, modes - n))))
-    is_left = is_left * jnp.ravel(jnp.tile(jnp.arange(modes) < case.n_modes, 3))
+    is_left = is_left * jnp.ravel(jnp.tile(jnp.arange(modes) < case.n_modes, structure.n_links))
     # omega of mode j grows as j^2; fixed weights, so that derivatives are of the loop alone
-    weight = is_left * jnp.tile(jnp.arange(1.0, modes + 1) ** 4, 3)
-    first, last = 6, 6 + 3 * modes
+    weight = is_left * jnp.tile(jnp.arange(1.0, modes + 1) ** 4, structure.n_links)
+    first = 2 * structure.n_pose
+    last = first + structure.n_links * modes
 
     def ringing(transition: Array) -> tuple[Array, Summed]:
         outputs = jnp.zeros(transition.shape[0], transition.dtype).at[first:last].set(weight)
@@ -570,9 +580,12 @@ def spillover(structure: Structure, case: Case, matrices: LoopMatrices) -> Array
         return jnp.diagonal(gramian.share)[first:last], gramian
 
     # the plant's states and those of a sampled drive; electronics do not act back on them
-    size, drive = matrices.open.shape[0], resting_drive(DRIVES[structure.drive], jnp.zeros((3,)))
+    size, drive = (
+        matrices.open.shape[0],
+        resting_drive(DRIVES[structure.drive], jnp.zeros((structure.n_links,))),
+    )
     count = sum(x.size for x in jax.tree.leaves(drive))
-    kept = np.r_[0 : 6 + 6 * modes, size - count : size]
+    kept = np.r_[0 : 2 * last - first, size - count : size]
     plant = matrices.open[np.ix_(kept, kept)]
     loop = matrices.open + matrices.feedback
     (free_energy, free), (energy, closed) = ringing(plant), ringing(loop)

@@ -80,7 +80,7 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
     elif structure.has_wrench:  # the settled output of the drive's integrators
         still = jnp.zeros_like(reference.position[0])
         held = torque(reference.position[0], still, still)
-        forward = jnp.broadcast_to(held, (n, per_sample + 1, 3))
+        forward = jnp.broadcast_to(held, (n, per_sample + 1, structure.n_links))
 
     is_buckled = jnp.any(steady_load(structure, case, plant) >= 1)
     time = period * jnp.arange(n)
@@ -193,12 +193,12 @@ def _disturbance(
     """(standard normal ADC noise or None, slider disturbance [N])."""
     drive, n = prepared.loop.drive, structure.n_steps
     share = _share_on(time, drive.pulse_start, drive.pulse_length)
-    force = share[:, None] * jnp.broadcast_to(drive.pulse_force, (n, 3))
+    force = share[:, None] * jnp.broadcast_to(drive.pulse_force, (n, structure.n_links))
     if not structure.has_noise:
         return None, force
     adc_key, ripple_key = jax.random.split(jax.random.key(case.seed))
-    noise = jax.random.normal(adc_key, (n, 3, structure.n_patches), time.dtype)
-    ripple = jax.random.normal(ripple_key, (n, 3), time.dtype)
+    noise = jax.random.normal(adc_key, (n, structure.n_links, structure.n_patches), time.dtype)
+    ripple = jax.random.normal(ripple_key, (n, structure.n_links), time.dtype)
     return noise, force + drive.ripple * ripple
 
 
@@ -239,7 +239,8 @@ class Outline(NamedTuple):
     saturation_limit: Array  # [1], ()
     arrival_tolerance: Array  # [m], ()
     critical_force: Array  # N_cr of the links [N], (3,)
-    joint_radius: Array  # largest distance of a joint from the platform's reference point [m], ()
+    # largest distance of a joint from the platform's reference point [m], (); None: it is a point
+    joint_radius: Array | None
     singularity_distance: Array  # [rad], ()
     singularity_margin: Array  # [rad], ()
 
@@ -287,17 +288,23 @@ def begin(structure: Structure, case: Case) -> Start:
             saturation_limit=jnp.asarray(case.windows.saturation_limit),
             arrival_tolerance=jnp.asarray(case.windows.arrival_tolerance),
             critical_force=_allowed_compression(case, loop.plant),
-            joint_radius=jnp.max(jnp.asarray(case.machine.geometry.joint_radius)),
+            joint_radius=_joint_radius(loop.plant),
             singularity_distance=outside.singularity_distance,
             singularity_margin=jnp.asarray(case.windows.singularity_margin),
         ),
     )
 
 
+def _joint_radius(plant: Plant) -> Array | None:
+    if plant.joint_cos is None or plant.joint_sin is None:
+        return None
+    return jnp.sqrt(jnp.max(plant.joint_cos**2 + plant.joint_sin**2))
+
+
 def _allowed_compression(case: Case, plant: Plant) -> Array:
     """Critical force of the links, even if the model ignores buckling [N], (3,)."""
     if plant.shortening is None:
-        return euler_force(case.machine.beam)
+        return euler_force(case.machine)
     return critical_force(plant)
 
 
@@ -316,7 +323,9 @@ def conclude(outline: Outline, code: Array, last: State, record: Record | None =
     result = metrics.finish(last.totals, outline.ending)
     final = last.status
     limit, error = outline.saturation_limit, result.pose_error_rms
-    miss = jnp.sqrt(error[0] ** 2 + error[1] ** 2) + outline.joint_radius * error[2]
+    miss = jnp.sqrt(error[0] ** 2 + error[1] ** 2)
+    if outline.joint_radius is not None:
+        miss = miss + outline.joint_radius * error[2]
     is_overloaded = jnp.any(result.peak_compression > outline.critical_force)
     for is_wrong, bad in (
         (is_overloaded, status.OVERLOADED),

@@ -128,7 +128,7 @@ def test_drive_damps_the_pose_modes():
 def test_flatten_and_unflatten_are_inverse():
     rng = np.random.default_rng(0)
     state = PlantState(*rng.normal(size=(2, 3)), *rng.normal(size=(2, 3, 5)))
-    for before, after in zip(state[:4], unflatten(flatten(state), 5), strict=False):
+    for before, after in zip(state[:4], unflatten(flatten(state), structure), strict=False):
         np.testing.assert_array_equal(before, after)
 
 

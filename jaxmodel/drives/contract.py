@@ -93,7 +93,7 @@ def drive_gains(law: DriveLaw, drive: Drive) -> DriveGains:
         law: of the drive.
         drive: its numbers, fields (3,) or ().
     """
-    zero = jnp.zeros((3,), jnp.result_type(float))
+    zero = jnp.zeros(jnp.shape(drive.pulse_force), jnp.result_type(float))
     memory = None if law.update is None else zero
 
     def slope(position: Array, rate: Array) -> Array:

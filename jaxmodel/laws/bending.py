@@ -61,7 +61,7 @@ def bent(case: Case, model: LinkModel) -> BentModel:
     """
     n, count = model.drive.shape[1:]
     kept = force_decay(case)[:, None, None] * jnp.eye(count)
-    below = jnp.concatenate([jnp.zeros((3, count, n)), kept], axis=2)
+    below = jnp.concatenate([jnp.zeros((len(kept), count, n)), kept], axis=2)
     above = jnp.concatenate([model.state, model.drive], axis=2)
     more = ((0, 0), (0, count), (0, 0))
     wide = LinkModel(

@@ -67,7 +67,9 @@ def check_law(law: Law) -> None:
     check_parameters(place, law.parameters)
 
 
-def check_feedback(law: Law, feedback: Feedback, n_channels: int, n_patches: int) -> None:
+def check_feedback(
+    law: Law, feedback: Feedback, n_links: int, n_channels: int, n_patches: int
+) -> None:
     """Raise PartError unless a law returned feedback of the right kind and shapes."""
     kind = StateSpace if law.channel == "none" else Channels
     if not isinstance(feedback, kind):
@@ -75,7 +77,7 @@ def check_feedback(law: Law, feedback: Feedback, n_channels: int, n_patches: int
             f"law {law.name!r}: design returns {feedback!r}; expected {kind.__name__}, as its "
             f"channel = {law.channel!r} says"
         )
-    for name, shape in _shapes(feedback, n_channels, n_patches).items():
+    for name, shape in _shapes(feedback, n_links, n_channels, n_patches).items():
         value = getattr(feedback, name)
         if jnp.shape(value) != shape:
             raise PartError(
@@ -85,17 +87,19 @@ def check_feedback(law: Law, feedback: Feedback, n_channels: int, n_patches: int
             raise PartError(f"law {law.name!r}: {name} is complex; expected real numbers")
 
 
-def _shapes(feedback: Feedback, n_channels: int, n_patches: int) -> dict[str, tuple[int, ...]]:
+def _shapes(
+    feedback: Feedback, n_links: int, n_channels: int, n_patches: int
+) -> dict[str, tuple[int, ...]]:
     if isinstance(feedback, Channels):
         return {
-            "filter": (3, n_channels, n_patches),
-            "synthesizer": (3, n_patches, n_channels),
-            "velocity_gain": (3, n_channels),
-            "position_gain": (3, n_channels),
+            "filter": (n_links, n_channels, n_patches),
+            "synthesizer": (n_links, n_patches, n_channels),
+            "velocity_gain": (n_links, n_channels),
+            "position_gain": (n_links, n_channels),
         }
     groups, n, b = jnp.shape(feedback.state)[:3]
-    groups = 1 if groups == 1 else 3
-    size = 3 * n_patches // groups
+    groups = 1 if groups == 1 else n_links
+    size = n_links * n_patches // groups
     shapes = {
         "state": (groups, n, b, b),
         "enter": (groups, n, b, size),

@@ -14,6 +14,15 @@ from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 
 
+class Mechanism(NamedTuple):
+    """What is static of a mechanism."""
+
+    name: str  # in studies
+    title: str  # in reports
+    n_links: int  # flexible links, each with an actuated joint
+    n_pose: int  # coordinates of the platform: 3 of a rigid body, 2 of a point
+
+
 class Near(NamedTuple):
     """The near joints B of the links for given far joints C, (n,) each.
 

@@ -61,6 +61,8 @@ def check_screen_names(spec: SweepSpec, table: CaseTable) -> None:
         n_modes=int(table.values("link.modes").max()),
         n_controlled=int(table.values("control.modes").max()),
         n_frequencies=Structure().n_frequencies,
+        n_links=Structure().n_links,
+        n_pose=Structure().n_pose,
     ).axes
     parse_entries(spec.screen.entry, "sweep.screen.by", sizes)
 

@@ -94,7 +94,7 @@ def report(
         stations=", ".join(f"{100 * x:g}" for x in study.metrics.stations),
         watched=watched(run),
         command_end=float(result.command_end),
-        buckling=np.broadcast_to(euler_force(run.case.machine.beam), (3,)),
+        buckling=np.asarray(euler_force(run.case.machine)),
         n_modes=max(MARGIN_MODES, study.link.modes),
         links=link_rows(run, twin),
         platform=_platform(run),

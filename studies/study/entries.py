@@ -95,6 +95,8 @@ def entry_sizes(study: Study) -> dict[str, int]:
         n_modes=study.link.modes,
         n_controlled=study.control.modes,
         n_frequencies=Structure().n_frequencies,
+        n_links=Structure().n_links,
+        n_pose=Structure().n_pose,
     )
     return sizes.axes
 
