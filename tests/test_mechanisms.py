@@ -8,15 +8,23 @@ import pytest
 
 from jaxmodel import kinematics, status
 from jaxmodel.beam import build_basis
-from jaxmodel.mechanisms.five_bar.geometry import Geometry as FiveBar
+from jaxmodel.case import uncontrolled
+from jaxmodel.frequency_response import plant_response
+from jaxmodel.linear import linearise
+from jaxmodel.mechanisms.five_bar.cranks import FiveBarGeometry
 from jaxmodel.mechanisms.prrr.paper import paper_machine
-from jaxmodel.mechanisms.rrr.cranks import Geometry
+from jaxmodel.mechanisms.rrr.cranks import CrankGeometry
 from jaxmodel.plant import build_plant
+from jaxmodel.prepare import prepare
+from jaxmodel.simulate import simulate
+from studies.engine.stability import loop_report
 from studies.reference import lagrangian as reference
+from studies.study.cases import build_case, build_structure
+from studies.study.spec import paper_study
 
 R, N_STATES = 3, 100
 #: A 3-RRR: pivots on a circle, links as the paper's.
-CRANKS = Geometry(
+CRANKS = CrankGeometry(
     pivot_radius=0.30,
     pivot_angle=np.radians([210.0, 330.0, 90.0]),
     crank_length=0.16,
@@ -37,7 +45,7 @@ MACHINES = {
 }
 PAPER = paper_machine()
 MACHINES["five-bar"] = PAPER._replace(
-    geometry=FiveBar(
+    geometry=FiveBarGeometry(
         pivot_distance=0.2,
         crank_length=np.array([0.15, 0.16]),
         elbow=np.array([-1.0, 1.0]),
@@ -120,3 +128,94 @@ def test_accelerations_equal_lagrangian_and_multiplier_form(name, kind, shorteni
         axes = tuple(range(1, wanted.ndim))
         error = np.abs(mine - wanted).max(axis=axes) / np.abs(wanted).max(axis=axes)
         assert error.max() < 1e-10
+
+
+# --- the sampled loop -----------------------------------------------------------------------------
+
+#: Where loops are judged, and the first way-point.
+POSES = {"rrr": (0.0, 0.0, 0.0), "rrr unequal": (0.0, 0.0, 0.0), "five-bar": (0.0, 0.24)}
+#: Those that the paper's drive holds firmly there.
+STIFF = ("rrr", "five-bar")
+KEYS = {"rrr": "rrr", "rrr unequal": "rrr", "five-bar": "five_bar"}
+
+
+def case_of(name, **changes):
+    """Structure and case of a mechanism with the paper's links, control, electronics and drive."""
+    study = paper_study().change(run__duration=0.8, metrics__residual_delay=0.03, **changes)
+    structure, case = build_structure(study), build_case(study)
+    machine, home = MACHINES[name], np.array(POSES[name])
+    n = machine.n_links
+
+    def links(x):
+        return np.asarray(x)[:n] if np.shape(x)[:1] == (3,) else x
+
+    control, drive, initial = (
+        jax.tree.map(links, part) for part in (case.control, case.drive, case.initial)
+    )
+    square = np.array([[0, 0], [0, 1], [1, 1], [1, 0], [0, 0]]) * 0.01
+    waypoints = home + np.pad(square, ((0, 0), (0, n - 2)))
+    case = case._replace(
+        machine=machine,
+        path=case.path._replace(waypoints=waypoints),
+        control=control,
+        drive=drive,
+        initial=initial,
+        load=case.load._replace(wrench=np.zeros(n), pulse=np.zeros(n)),
+    )
+    return structure._replace(mechanism=KEYS[name]), case
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_closed_forms_of_the_linear_plant_are_those_of_its_matrices(name):
+    """Poles of mass, damping and stiffness by formula, and of the differentiated motion."""
+    structure, case = case_of(name)
+    loop = jax.jit(prepare, static_argnums=0)(structure, case).loop
+    pose = np.array(POSES[name])
+    plant = plant_response(structure, case, loop, pose)
+    n, size = structure.n_pose, structure.n_links * structure.n_modes
+    enter, leave = (np.swapaxes(x, 0, 1).reshape(n, size) for x in (plant.enter, plant.leave))
+    mass = np.block([[plant.mass, enter], [leave.T, np.eye(size)]])
+    zero = np.zeros((n, size))
+
+    def both(pose_part, modal_part):
+        return np.block([[pose_part, zero], [zero.T, np.diag(np.ravel(modal_part))]])
+
+    stiffness, damping = (
+        both(plant.stiffness, plant.square),
+        both(plant.damping, plant.decay),
+    )
+    by_formula = np.linalg.solve(mass, -np.hstack([stiffness, damping]))
+    matrix = np.vstack([np.eye(n + size, 2 * (n + size), n + size), by_formula])
+    linear = jax.jit(linearise, static_argnums=0)(structure, loop, pose)
+    found, wanted = (np.sort_complex(np.linalg.eigvals(x)) for x in (matrix, linear.state))
+    np.testing.assert_allclose(found, wanted, rtol=1e-8, atol=1e-8 * np.abs(wanted).max())
+
+
+@pytest.fixture(scope="module")
+def fast_runs():
+    """Residual vibration [m] of a fast unshaped square with and without control, (n,) each."""
+    runs = {}
+    for name in STIFF:
+        changes = {"motion__move_time": 0.03, "shaper__kind": "none"}
+        structure, case = case_of(name, **changes)
+        run = jax.jit(simulate, static_argnums=0)
+        runs[name] = [run(structure, x) for x in (case, uncontrolled(case))]
+    return runs
+
+
+@pytest.mark.parametrize("name", STIFF)
+def test_control_damps_every_mechanism(fast_runs, name):
+    """The paper's gains, electronics and converters on another machine."""
+    damped, free = fast_runs[name]
+    assert damped.status == free.status == status.OK
+    damped, free = (np.max(x.metrics.residual_rms, axis=1) for x in (damped, free))
+    assert damped.shape == (MACHINES[name].n_links,)
+    assert np.all(damped < free / 3) and free.max() > 1e-6
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_margins_are_finite_and_stable(name):
+    structure, case = case_of(name)
+    found = loop_report(structure, case, np.array(POSES[name]), 1)
+    assert found.is_stable and 2 < found.gain_margin < 10
+    assert found.frequency_hz.shape == (1, MACHINES[name].n_links)

@@ -150,7 +150,7 @@ def test_the_table_of_metrics_has_these_units_and_axes():
 # --- made-up signals ------------------------------------------------------------------------------
 
 N, PERIOD = 64, 2e-3
-SIZES = Sizes(n_stations=2, n_modes=3, n_controlled=2, n_frequencies=2)
+SIZES = Sizes(n_stations=2, n_modes=3, n_controlled=2, n_frequencies=2, n_links=3, n_pose=3)
 
 
 def made_up(seed):

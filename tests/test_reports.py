@@ -109,7 +109,7 @@ STUDY = paper_study().change(
     electronics__voltage_limit=91.0,
     drive__force_limit=77.0,
 )
-SIZES = Sizes(n_stations=3, n_modes=4, n_controlled=2, n_frequencies=9)
+SIZES = Sizes(n_stations=3, n_modes=4, n_controlled=2, n_frequencies=9, n_links=3, n_pose=3)
 
 
 def made_up_run(size=1.0, margin=3.25, code=status.OK, **changes):

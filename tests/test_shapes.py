@@ -87,7 +87,7 @@ def test_shapes_are_those_of_the_comments(made):
 
 
 def test_metrics_have_their_dims(made):
-    sizes = Sizes(7, 5, 2, made["result"][0].metrics.spectral_density.shape[-1])
+    sizes = Sizes(7, 5, 2, made["result"][0].metrics.spectral_density.shape[-1], 3, 3)
     for name, value in made["result"][0].metrics.items():
         wanted = tuple(sizes.axes[axis] for axis in METRICS[name].dims)
         assert np.shape(value) == wanted, name

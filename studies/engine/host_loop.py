@@ -42,41 +42,44 @@ def sampled_loop(
     matrices: LoopMatrices, omega: np.ndarray, period: float, n_tracked: int
 ) -> SampledLoop:
     """A loop on the host from matrices of `jaxmodel.sampled_loop`, NumPy arrays."""
-    is_drive = np.arange(len(matrices.open)) < 6
+    is_drive = np.arange(len(matrices.open)) < 2 * len(omega)
     if matrices.reference is not None:  # the states that it enters are those of a sampled drive
         is_drive |= np.any(matrices.reference != 0, axis=1)
     return SampledLoop(
         open=matrices.open,
         feedback=matrices.feedback,
-        mode_poles=link_poles(matrices.plant, n_tracked),
+        mode_poles=link_poles(matrices.plant, len(omega), n_tracked),
         omega=omega,
         period=period,
         is_drive=is_drive,
     )
 
 
-def link_poles(state: np.ndarray, n_tracked: int) -> np.ndarray:
-    """Poles [rad/s] of the uncontrolled link modes, in threes by ascending frequency, (J, 3).
+def link_poles(state: np.ndarray, n_links: int, n_tracked: int) -> np.ndarray:
+    """Poles [rad/s] of the uncontrolled link modes, by ascending frequency, (J, n_links).
 
     These are the eigenvalues whose eigenvectors lie mainly in the modal coordinates; overdamped
     modes have no such pole: NaN.
 
     Args:
         state: A of the plant, `LoopMatrices.plant`.
+        n_links: as many as the pose has coordinates.
         n_tracked: J.
     """
-    modes = (state.shape[0] - 6) // 2
+    pose = n_links
+    modes = state.shape[0] // 2 - pose
     value, vector = np.linalg.eig(state)
     upper = value.imag > 0
     vector, value = vector[:, upper], value[upper]
-    weight = np.abs(vector[:3]).max(axis=0) / np.abs(vector[6 : 6 + modes]).max(axis=0)
-    # at most three pairs belong to the pose on its drive: those with the largest pose share
+    bending = np.abs(vector[2 * pose : 2 * pose + modes])
+    weight = np.abs(vector[:pose]).max(axis=0) / bending.max(axis=0)
+    # at most as many pairs belong to the pose on its drive: those with the largest pose share
     n_rigid = value.size - modes
     flexible = np.sort_complex(1j * value[np.argsort(weight)[: value.size - max(n_rigid, 0)]])
     flexible = flexible[np.argsort(np.abs(flexible))] / 1j
-    kept = min(flexible.size // 3, n_tracked)
-    poles = np.full((n_tracked, 3), np.nan, complex)
-    poles[:kept] = flexible[: 3 * kept].reshape(kept, 3)
+    kept = min(flexible.size // n_links, n_tracked)
+    poles = np.full((n_tracked, n_links), np.nan, complex)
+    poles[:kept] = flexible[: n_links * kept].reshape(kept, n_links)
     return poles
 
 
@@ -95,15 +98,18 @@ def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
         pole: one of its poles then.
     """
     right, left = _eigenvectors(loop.open + factor * loop.feedback, pole)
-    r = loop.n_modes
-    last = 6 + 6 * r  # the rest is sensors behind their filters, the controller, and the drive
+    n, r = loop.omega.shape
+    first, last = (
+        2 * n,
+        2 * n + 2 * n * r,
+    )  # the rest is sensors behind their filters, the controller, and the drive
     share = left * right
-    parts = (share[loop.is_drive], share[6:last], share[last:][~loop.is_drive[last:]])
+    parts = (share[loop.is_drive], share[first:last], share[last:][~loop.is_drive[last:]])
     drive, links, filters = (abs(part.sum()) for part in parts)
     hertz = abs(np.log(pole)) / loop.period / (2 * np.pi)
     if drive > max(links, filters):
         return f"drive of the sliders ({hertz:.0f} Hz)"
-    q, q_rate = np.abs(right[6:last].reshape(2, 3, r))
+    q, q_rate = np.abs(right[first:last].reshape(2, n, r))
     energy = (loop.omega * q) ** 2 + q_rate**2
     modes, moving = _dominant(energy.sum(axis=0)), _dominant(energy.sum(axis=1))
     own = ", ".join(f"{loop.omega[moving, j].mean() / (2 * np.pi):.0f}" for j in modes)

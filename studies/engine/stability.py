@@ -331,7 +331,7 @@ def follow_modes(
     start = np.exp(loop.mode_poles[has_poles] * loop.period)
     path = follow_poles(start.ravel(), map(poles, map(float, factors)))
     tracked = np.full((len(factors), *loop.mode_poles.shape), np.nan, complex)
-    tracked[:, has_poles] = path.reshape(len(factors), -1, 3)
+    tracked[:, has_poles] = path.reshape(len(factors), *start.shape)
     return tracked
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxmodel.beam import ModalBasis
 from jaxmodel.dynamics import Accelerations, accelerations, modal_chain
 from jaxmodel.kinematics import Chain
-from jaxmodel.mechanisms.five_bar import geometry as five_bar
+from jaxmodel.mechanisms.five_bar import cranks as five_bar
 from jaxmodel.mechanisms.prrr import guides as prrr
 from jaxmodel.parameters import Machine
 from jaxmodel.plant import Plant
@@ -38,7 +38,7 @@ class Loads(NamedTuple):
     modal: Any  # on the modal coordinates [N], (3, R)
 
 
-def guides(geometry: prrr.Geometry) -> tuple[jax.Array, jax.Array, jax.Array]:
+def guides(geometry: prrr.GuideGeometry) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Starting corners A_i [m], directions u_i and inward normals n_i, (3, 2) each."""
     angle = geometry.guide_angle
     u = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
@@ -49,7 +49,7 @@ def guides(geometry: prrr.Geometry) -> tuple[jax.Array, jax.Array, jax.Array]:
 
 def pivots(geometry: Any) -> jax.Array:
     """A_i of the cranks [m], (n, 2)."""
-    if isinstance(geometry, five_bar.Geometry):
+    if isinstance(geometry, five_bar.FiveBarGeometry):
         return jnp.array([[-0.5, 0.0], [0.5, 0.0]]) * geometry.pivot_distance
     angle = geometry.pivot_angle
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1) * jnp.reshape(
@@ -59,7 +59,7 @@ def pivots(geometry: Any) -> jax.Array:
 
 def near_joints(geometry: Any, rho: Any) -> Any:
     """Joints B_i [m] by the actuated coordinates, (n, 2)."""
-    if isinstance(geometry, prrr.Geometry):
+    if isinstance(geometry, prrr.GuideGeometry):
         corner, u, _ = guides(geometry)
         return corner + rho[:, None] * u
     theta = geometry.zero_angle + geometry.elbow * rho / geometry.crank_length
@@ -69,7 +69,7 @@ def near_joints(geometry: Any, rho: Any) -> Any:
 
 def reach(geometry: Any, joints: Any, distance: Any) -> Any:
     """Actuated coordinates that put B_i at a distance from C_i [m], (n,)."""
-    if isinstance(geometry, prrr.Geometry):
+    if isinstance(geometry, prrr.GuideGeometry):
         corner, u, n = guides(geometry)
         to_joint = joints - corner
         slant = jnp.arcsin(jnp.sum(to_joint * n, axis=1) / distance)
@@ -84,7 +84,7 @@ def reach(geometry: Any, joints: Any, distance: Any) -> Any:
 
 def platform_joints(geometry: Any, pose: jax.Array) -> jax.Array:
     """Joints C_i [m] of the platform, (n, 2)."""
-    if isinstance(geometry, five_bar.Geometry):
+    if isinstance(geometry, five_bar.FiveBarGeometry):
         return jnp.stack([pose, pose])
     angle = geometry.joint_angle + pose[2]
     radius = jnp.broadcast_to(geometry.joint_radius, (3,))

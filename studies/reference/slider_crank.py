@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxmodel import dynamics
 from jaxmodel.beam import build_basis
-from jaxmodel.mechanisms.prrr.guides import Geometry
+from jaxmodel.mechanisms.prrr.guides import GuideGeometry
 from jaxmodel.mechanisms.prrr.paper import paper_machine
 from jaxmodel.parameters import Damping, Masses
 from jaxmodel.plant import build_plant
@@ -32,7 +32,7 @@ RATES = np.array([-0.444896105, 4.63434311e-3])  # of the rod's modes at the sta
 SIDE = 1.0
 THROUGH_ORIGIN = -SIDE / np.sqrt(12.0)
 MACHINE = paper_machine()._replace(
-    geometry=Geometry(
+    geometry=GuideGeometry(
         guide_side=SIDE,
         guide_angle=np.pi + np.array([0, 2 * np.pi / 3, 4 * np.pi / 3]),
         joint_radius=0.0,

@@ -28,7 +28,7 @@ from jaxmodel.case import (
 from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law
-from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES, Geometry
+from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES, GuideGeometry
 from jaxmodel.parameters import Beam, Damping, Machine, Masses, Patches
 from studies.study.consistency import patch_centers
 from studies.study.fields import Columns, Fields
@@ -204,7 +204,7 @@ def as_arrays(case: Tree) -> Tree:
 def _machine(numbers: Numbers, structure: Structure, xp: Any) -> Machine:
     number = numbers.__getitem__
     return Machine(
-        geometry=Geometry(
+        geometry=GuideGeometry(
             guide_side=number("machine.guide_side"),
             guide_angle=xp.radians(number("machine.guide_angles_deg")),
             joint_radius=number("machine.joint_radius"),

@@ -35,10 +35,17 @@ class Guides(NamedTuple):
         h = self.ux * y - self.uy * x + self.h0
         root_squared = squared - h * h
         root = safe_root(root_squared, floor)
-        return Near(self.ux, self.uy, root, root_squared, h, s - root)
+        return Near(
+            x=self.ux,
+            y=self.uy,
+            root=root,
+            root_squared=root_squared,
+            across=h,
+            position=s - root,
+        )
 
 
-class Geometry(NamedTuple):
+class GuideGeometry(NamedTuple):
     """Guides and platform joints. The paper's guides are the sides of a triangle around O."""
 
     guide_side: Array  # a [m], ()

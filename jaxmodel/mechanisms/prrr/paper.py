@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES, Geometry
+from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES, GuideGeometry
 from jaxmodel.parameters import Beam, Damping, Machine, Masses, Patches
 
 #: Home pose (x [m], y [m], phi [rad]) of the paper.
@@ -18,7 +18,7 @@ def paper_machine() -> Machine:
     density) are the estimates listed in docs/theory.md.
     """
     return Machine(
-        geometry=Geometry(
+        geometry=GuideGeometry(
             guide_side=0.6,
             guide_angle=np.array([2 * np.pi / 3, 4 * np.pi / 3, 0.0]),
             joint_radius=0.12 / np.sqrt(3.0),

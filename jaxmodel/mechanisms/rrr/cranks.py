@@ -55,7 +55,7 @@ class Cranks(NamedTuple):
         )
 
 
-class Geometry(NamedTuple):
+class CrankGeometry(NamedTuple):
     """Cranks about pivots on a circle around O, and platform joints."""
 
     pivot_radius: Array  # distance O - A_i [m], () or (n,)

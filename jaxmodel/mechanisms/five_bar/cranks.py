@@ -9,7 +9,7 @@ from jaxmodel.mechanisms.rrr.cranks import Cranks
 from jaxmodel.parameters import Array
 
 
-class Geometry(NamedTuple):
+class FiveBarGeometry(NamedTuple):
     """Cranks about pivots on the x axis, which are as far from O on either side."""
 
     pivot_distance: Array  # from one pivot to the other [m], ()
