@@ -11,8 +11,8 @@ class PartError(ValueError):
 
 
 class Parameter(NamedTuple):
-    """An entry's own field in the study file, `[control.laws.NAME]` or
-    `[drive.kinds.NAME]`; one number, or three."""
+    """An entry's own field in the study file, `[control.laws.NAME]`,
+    `[drive.kinds.NAME]` or `[machine.kinds.NAME]`; one number, or three."""
 
     name: str
     default: float

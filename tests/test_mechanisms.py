@@ -17,10 +17,15 @@ from jaxmodel.mechanisms.rrr.cranks import CrankGeometry
 from jaxmodel.plant import build_plant
 from jaxmodel.prepare import prepare
 from jaxmodel.simulate import simulate
+from studies.engine.runs import run_study
 from studies.engine.stability import loop_report
+from studies.errors import StudyError
 from studies.reference import lagrangian as reference
+from studies.space.spec import parse_sweep
 from studies.study.cases import build_case, build_structure
-from studies.study.spec import paper_study
+from studies.study.spec import paper_study, parse_study
+from studies.study.window import rigid_machine
+from tests.test_kernel import both, check_equal
 
 R, N_STATES = 3, 100
 #: A 3-RRR: pivots on a circle, links as the paper's.
@@ -219,3 +224,51 @@ def test_margins_are_finite_and_stable(name):
     found = loop_report(structure, case, np.array(POSES[name]), 1)
     assert found.is_stable and 2 < found.gain_margin < 10
     assert found.frequency_hz.shape == (1, MACHINES[name].n_links)
+
+
+# --- studies --------------------------------------------------------------------------------------
+
+CRANKED = {
+    "machine": {"kind": "rrr", "joint_radius": 0.07, "kinds": {"rrr": {"crank_length": 0.15}}},
+    "motion": {"waypoints": [[0.0, 0.0, 0.0], [0.0, 0.01, 0.0]], "move_time": 0.03},
+    "run": {"duration": 0.3},
+}
+
+
+def test_a_study_of_a_3_rrr_runs():
+    run = run_study(parse_study(CRANKED), has_record=False)
+    assert run.status == status.OK and 2 < run.loop.gain_margin < 10
+    assert float(run.case.machine.geometry.crank_length[0]) == 0.15
+    near_mass = np.asarray(run.case.machine.masses.slider_mass)
+    np.testing.assert_allclose(near_mass, 4e-3 / 0.15**2)
+
+
+def test_settling_time_is_that_of_the_rigid_machine():
+    """Inertia and rates without JAX equal those of the linear plant with stiff links."""
+    study = parse_study(CRANKED)
+    inertia, rates = rigid_machine(study)
+    structure, case = build_structure(study), build_case(study)
+    loop = jax.jit(prepare, static_argnums=0)(structure, case).loop
+    plant = plant_response(structure, case, loop, np.array(study.motion.waypoints[-1]))
+    np.testing.assert_allclose(rates, plant.slide, atol=1e-12)
+    np.testing.assert_allclose(inertia, plant.mass, rtol=1e-9, atol=1e-15)
+
+
+def test_kernel_equals_scan_on_cranks():
+    axes = {"machine.kinds.rrr.crank_length": [0.14, 0.16, 0.18], "control.gain_factor": [0.5, 1.0]}
+    spec = parse_sweep(CRANKED | {"run": {"duration": 0.2}, "sweep": {"axes": axes}})
+    check_equal(*both(spec))
+
+
+@pytest.mark.parametrize(
+    "machine, message",
+    [
+        ({"kind": "rrrr"}, "machine.kind = 'rrrr'.*prrr"),
+        ({"kind": "five_bar"}, "machine.kind = 'five_bar'; allowed: prrr, rrr"),
+        ({"kinds": {"rrr": {"crank": 1.0}}}, "machine.kinds.rrr.crank = 1.0.*crank_length"),
+        ({"kinds": {"rrr": {"crank_length": 0.0}}}, "crank_length = 0.0; allowed: 0.001 to 10"),
+    ],
+)
+def test_bad_mechanisms_are_refused(machine, message):
+    with pytest.raises(StudyError, match=message):
+        parse_study({"machine": machine})

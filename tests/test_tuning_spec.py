@@ -557,7 +557,7 @@ def test_each_law_is_tuned_by_its_own_parameters():
     assert moved["own"] == [True, False, False]
     assert moved["lqg"] == [True, True, False] and moved["ppf"] == [True, False, True]
     assert [spec.parts(family).law for family in spec.families] == ["lqg", "ppf", "imsc"]
-    assert spec.parts() == ("imsc", "pd") and len(spec.studies(Parts("lqg", "pd"))) == 1
+    assert spec.parts()[:2] == ("imsc", "pd") and len(spec.studies(Parts("lqg", "pd"))) == 1
     assert spec.has_position_gain(Parts("ppf", "pd"))
     assert not spec.has_position_gain(spec.parts())
 

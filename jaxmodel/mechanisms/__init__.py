@@ -1,9 +1,14 @@
-"""Mechanisms: one folder each, `contract` says what is in it."""
+"""Mechanisms, one folder each; `contract` defines what a mechanism is.
 
-from jaxmodel.mechanisms.contract import Mechanism
+One in `MECHANISMS` can be selected by `machine.kind` in a study file. To add one, write a folder
+like `rrr` and add its `Mechanism` to the list below; from outside the package, use
+`MECHANISMS.add`.
+"""
+
+from jaxmodel.mechanisms.contract import Mechanism, check_mechanism
 from jaxmodel.mechanisms.five_bar import FIVE_BAR
 from jaxmodel.mechanisms.prrr import PRRR
 from jaxmodel.mechanisms.rrr import RRR
+from jaxmodel.table import Table
 
-#: By name.
-MECHANISMS: dict[str, Mechanism] = {x.name: x for x in (PRRR, RRR, FIVE_BAR)}
+MECHANISMS: Table[Mechanism] = Table("mechanism", [PRRR, RRR, FIVE_BAR], check_mechanism)

@@ -8,19 +8,43 @@ distinguishes one mechanism from another in the equations of motion.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
 
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
+from jaxmodel.table import Parameter, PartError, check_parameters
 
 
 class Mechanism(NamedTuple):
-    """What is static of a mechanism."""
+    """A mechanism.
 
-    name: str  # in studies
-    title: str  # in reports
+    `build(own, machine, xp)` returns its `Geometry` and the mass that moves with B on each leg
+    [kg]: `own` are its parameters, `machine` the numbers of `[machine]` (angles in radians as
+    `guide_angle` and `joint_angle`), `xp` NumPy or `jax.numpy`.
+    """
+
+    name: str  # in study files
+    text: str  # in reports
     n_links: int  # flexible links, each with an actuated joint
     n_pose: int  # coordinates of the platform: 3 of a rigid body, 2 of a point
+    build: Callable[[dict[str, Array], dict[str, Array], Any], tuple[Geometry, Array]]
+    parameters: tuple[Parameter, ...] = ()
+
+
+def check_mechanism(mechanism: Mechanism) -> None:
+    """Raise PartError if the description of a mechanism is invalid."""
+    place = f"mechanism {mechanism.name!r}"
+    if not callable(mechanism.build):
+        raise PartError(f"{place}: build = {mechanism.build!r}; expected a function")
+    if mechanism.n_pose not in (2, 3) or mechanism.n_links != mechanism.n_pose:
+        raise PartError(
+            f"{place}: n_links = {mechanism.n_links}, n_pose = {mechanism.n_pose}; allowed: 3 and "
+            "3, or 2 and 2"
+        )
+    check_parameters(place, mechanism.parameters)
 
 
 class Near(NamedTuple):
@@ -51,33 +75,43 @@ class Legs(Protocol):
     def side(self, gamma: Array) -> Array:
         """Of a link's angle or its sine: positive on the right side of the path."""
 
-    def near(self, x: Array, y: Array, squared: Array, floor: Array) -> Near:
+    def near(self, x: Array, y: Array, squared: Array, floor: Array, xp: Any = jnp) -> Near:
         """Where the near joints are.
 
         Args:
             x, y: of the far joints C [m], (n,) each.
             squared: distance of C from B [m2].
             floor: `root_squared` is no less in `root` [m2].
+            xp: NumPy or `jax.numpy`.
         """
 
 
 class Geometry(Protocol):
     """Numbers that describe a mechanism: a NamedTuple of arrays."""
 
-    def legs(self) -> Legs:
+    def legs(self, xp: Any = jnp) -> Legs:
         """Paths of the near joints."""
 
-    def arms(self) -> tuple[Array, Array] | None:
+    def arms(self, xp: Any = jnp) -> tuple[Array, Array] | None:
         """Far joints in the platform's axes [m], (n,) each; None: the platform is a point."""
 
+    def size(self) -> float:
+        """How large it is [m]; NumPy numbers."""
 
-def polar(radius: Array, angle: Array) -> tuple[Array, Array]:
+    def carriers(self, near: np.ndarray) -> np.ndarray:
+        """Lines of what carries the near joints [m], (n, 2, 2), for a drawing.
+
+        near: places of the near joints [m], (n, 2).
+        """
+
+
+def polar(radius: Array, angle: Array, xp: Any) -> tuple[Array, Array]:
     """Points by their distance [m], () or (n,), and direction [rad], (n,)."""
-    angle = jnp.asarray(angle)
-    radius = jnp.broadcast_to(jnp.asarray(radius), angle.shape)
-    return radius * jnp.cos(angle), radius * jnp.sin(angle)
+    angle = xp.asarray(angle)
+    radius = xp.broadcast_to(xp.asarray(radius), angle.shape)
+    return radius * xp.cos(angle), radius * xp.sin(angle)
 
 
-def safe_root(squared: Array, floor: Array) -> Array:
+def safe_root(squared: Array, floor: Array, xp: Any) -> Array:
     """Root of a number that may be negative where nothing depends on it."""
-    return jnp.sqrt(jnp.maximum(squared, floor))
+    return xp.sqrt(xp.maximum(squared, floor))

@@ -34,7 +34,7 @@ def draw_machine(
         alpha: opacity [1].
     """
     ax = axes_or_new(ax)
-    for start, end in parts.guide:
+    for start, end in parts.carrier[k]:
         ax.plot(*zip(1e3 * start, 1e3 * end, strict=True), color="#AAAAAA", linewidth=2.5, zorder=0)
     ax.fill(*(1e3 * parts.joint[k].T), color=color, alpha=0.25 * alpha, linewidth=0)
     for link in parts.link[k]:

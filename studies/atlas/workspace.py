@@ -21,6 +21,7 @@ from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from studies.engine.preflight import check_pose, check_run
 from studies.engine.programs import kept_jit
+from studies.study.geometry import machine_geometry
 from studies.study.spec import Study
 
 #: Modes per link in these matrices; assembled frequencies converge with the first one.
@@ -158,7 +159,7 @@ def _extent(
     structure: Structure, case: Case, study: Study, phi: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Grid lines that cover all feasible poses."""
-    axis = np.linspace(-0.6, 0.6, 121) * study.machine.guide_side
+    axis = np.linspace(-0.6, 0.6, 121) * machine_geometry(study)[0].size()
     grid = np.stack(np.meshgrid(phi, axis, axis, indexing="ij")[::-1], axis=-1)
     codes = _solve_poses(structure, case, grid.reshape(-1, 3))[0]
     good = (np.asarray(codes) == status.OK).reshape(grid.shape[:-1]).any(axis=0)

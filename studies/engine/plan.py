@@ -34,6 +34,7 @@ STATIC = (
     "control.feedback",
     "control.law",
     "drive.kind",
+    "machine.kind",
     "run.substeps",
     "run.smooth",
     "run.duration",

@@ -102,7 +102,7 @@ def _in_pictures(row: int, run: Run, twin: Run | None) -> ReplayedCase:
         time=1e3 * (time[points] - end),
         frame_time=1e3 * (time[frames] - end),
         exaggeration=factor,
-        guide=1e3 * parts.guide,
+        guide=1e3 * parts.carrier[0],
         motions=tuple(motions),
     )
 

@@ -15,7 +15,6 @@ from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
-from studies.show.sketch import guides
 from studies.study.spec import Study
 
 #: Points along a link.
@@ -25,7 +24,7 @@ POINTS = 41
 class Skeleton(NamedTuple):
     """Positions of all parts, (T, ...) in metres."""
 
-    guide: np.ndarray  # ends of the guides, (3, 2, 2)
+    carrier: np.ndarray  # ends of guides or cranks, (T, 3, 2, 2)
     slider: np.ndarray  # B, (T, 3, 2)
     joint: np.ndarray  # C, (T, 3, 2)
     link: np.ndarray  # points along the links, (T, 3, points, 2)
@@ -45,9 +44,8 @@ def skeleton(study: Study, pose: np.ndarray, q: np.ndarray, exaggeration: float)
         np.asarray(part)
         for part in _positions(structure._replace(n_steps=1), case, pose, q, exaggeration)
     )
-    direction, _, start = guides(case)
-    end = start + study.machine.guide_side * direction
-    return Skeleton(np.stack([start, end], axis=1), slider, joint, link)
+    carrier = np.stack([case.machine.geometry.carriers(x) for x in slider])
+    return Skeleton(carrier, slider, joint, link)
 
 
 @kept_jit(static_argnums=0)

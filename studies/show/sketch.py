@@ -13,6 +13,7 @@ from jaxmodel.case import Case
 from studies.show import figures
 from studies.study.cases import build_case
 from studies.study.consistency import each_link, patch_centers
+from studies.study.geometry import machine_geometry
 from studies.study.spec import Study
 
 #: Colours of controlled links, other links, actuators and sensors.
@@ -38,7 +39,7 @@ def sketch(study: Study) -> Figure:
     figure = Figure(figsize=(3.4, 5.2), layout="constrained")
     ax: Axes
     ax, below = figure.subplots(2, 1, height_ratios=(3.0, 2.2))
-    _guides(ax, study, case)
+    _carriers(ax, case, slider)
     ax.fill(*(1e3 * joint.T), color="#DDDDDD", zorder=1)
     for i, (start, end) in enumerate(zip(slider, joint, strict=True)):
         _link(ax, study, i, start, end)
@@ -67,32 +68,19 @@ def sketch(study: Study) -> Figure:
 
 
 def standing(case: Case, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sliders B and joints C [m] of straight links at a pose, (3, 2) each; NaN out of reach."""
-    u, n, corner = guides(case)
-    angle = case.machine.geometry.joint_angle + pose[2]
-    radius = np.asarray(case.machine.geometry.joint_radius)[..., None]
-    joint = pose[:2] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    away = joint - corner
-    height, length = np.sum(n * away, axis=1), each_link(case.machine.beam.length)
-    with np.errstate(invalid="ignore"):
-        rho = np.sum(u * away, axis=1) - np.sqrt(length**2 - height**2)
-    return corner + rho[:, None] * u, joint
+    """Joints B and C [m] of straight links at a pose, (3, 2) each; NaN out of reach."""
+    geometry, length = case.machine.geometry, each_link(case.machine.beam.length)
+    sine, cosine = np.sin(pose[2]), np.cos(pose[2])
+    x, y = geometry.arms(np)
+    joint = pose[:2] + np.stack([x * cosine - y * sine, y * cosine + x * sine], axis=1)
+    near = geometry.legs(np).near(*joint.T, length**2, 0.0, np)
+    away = np.stack(near.to_far(), axis=1)
+    return np.where(near.root_squared[:, None] < 0, np.nan, joint - away), joint
 
 
-def guides(case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Directions and inward normals of the guides, and where they start [m], (3, 2) each."""
-    geometry = case.machine.geometry
-    angle, side = np.asarray(geometry.guide_angle), float(geometry.guide_side)
-    u = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    n = np.stack([-u[:, 1], u[:, 0]], axis=1)
-    away = side / np.sqrt(12.0) + each_link(geometry.guide_offset)
-    return u, n, -away[:, None] * n - side / 2 * u
-
-
-def _guides(ax: Axes, study: Study, case: Case) -> None:
-    u, _, corner = guides(case)
-    for start, end in zip(corner, corner + study.machine.guide_side * u, strict=True):
-        ax.plot(*(1e3 * np.stack([start, end], axis=1)), color="#BBBBBB", linewidth=3, zorder=0)
+def _carriers(ax: Axes, case: Case, near: np.ndarray) -> None:
+    for line in case.machine.geometry.carriers(near):
+        ax.plot(*(1e3 * line.T), color="#BBBBBB", linewidth=3, zorder=0)
 
 
 def _link(ax: Axes, study: Study, i: int, start: np.ndarray, end: np.ndarray) -> None:
@@ -100,7 +88,7 @@ def _link(ax: Axes, study: Study, i: int, start: np.ndarray, end: np.ndarray) ->
         *(1e3 * np.stack([start, end], axis=1)), color=_color(study, i), linewidth=1.5, zorder=3
     )
     along = (end - start) / np.linalg.norm(end - start)
-    out = OUTSTANDING * study.machine.guide_side * np.array([-along[1], along[0]])
+    out = OUTSTANDING * machine_geometry(study)[0].size() * np.array([-along[1], along[0]])
     patches = study.patches
     for size, color, side in (
         (each_link(patches.actuator_length)[i], ACTUATOR, out),
@@ -192,7 +180,7 @@ def _links_to_scale(ax: Axes, study: Study) -> None:
 def _path(ax: Axes, study: Study, pose: np.ndarray) -> None:
     points = np.array(study.motion.waypoints, float)[:, :2]
     size = np.linalg.norm(np.ptp(points, axis=0))
-    least = SHORTEST_PATH * study.machine.guide_side
+    least = SHORTEST_PATH * machine_geometry(study)[0].size()
     factor = np.ceil(least / size) if 0 < size < least else 1.0
     drawn = 1e3 * (pose[:2] + factor * (points - pose[:2]))
     ax.plot(*drawn.T, color="#C00000", linewidth=1.2, zorder=5)

@@ -28,12 +28,13 @@ from jaxmodel.case import (
 from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law
-from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES, GuideGeometry
+from jaxmodel.mechanisms import MECHANISMS
+from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES
 from jaxmodel.parameters import Beam, Damping, Machine, Masses, Patches
 from studies.study.consistency import patch_centers
 from studies.study.fields import Columns, Fields
 from studies.study.numbers import Numbers, one_study, study_numbers
-from studies.study.spec import OWN_DRIVES, OWN_LAWS, Study
+from studies.study.spec import OWN_DRIVES, OWN_LAWS, OWN_MECHANISMS, Study
 
 Tree = TypeVar("Tree")  # a Case, or numbers
 TWO_PI = 2 * np.pi
@@ -69,6 +70,7 @@ def build_structure(study: Study, columns: Columns | None = None) -> Structure:
     steps = round(study.run.duration * study.electronics.sample_rate_hz)
     n_patches = patch_centers(study).shape[1]
     structure = Structure(
+        mechanism=study.machine.kind,
         n_modes=int(fields.numbers("link.modes").max()),
         n_controlled=min(int(fields.numbers("control.modes").max()), n_patches),
         n_patches=n_patches,
@@ -203,18 +205,13 @@ def as_arrays(case: Tree) -> Tree:
 
 def _machine(numbers: Numbers, structure: Structure, xp: Any) -> Machine:
     number = numbers.__getitem__
+    geometry, near_mass = _geometry(numbers, structure, xp)
     return Machine(
-        geometry=GuideGeometry(
-            guide_side=number("machine.guide_side"),
-            guide_angle=xp.radians(number("machine.guide_angles_deg")),
-            joint_radius=number("machine.joint_radius"),
-            joint_angle=_joint_angle(numbers, xp),
-            guide_offset=number("machine.guide_offsets"),
-        ),
+        geometry=geometry,
         masses=Masses(
             platform_mass=number("machine.platform_mass"),
             platform_inertia=number("machine.platform_inertia"),
-            slider_mass=number("machine.slider_mass"),
+            slider_mass=near_mass,
             payload_mass=number("load.mass"),
             payload_inertia=number("load.inertia"),
             payload_offset=number("load.offset") if structure.has_payload_offset else None,
@@ -231,6 +228,23 @@ def _machine(numbers: Numbers, structure: Structure, xp: Any) -> Machine:
         ),
         damping=_damping(numbers, xp),
     )
+
+
+def _geometry(numbers: Numbers, structure: Structure, xp: Any) -> tuple[Any, Any]:
+    """The mechanism's geometry, and the mass that moves with each near joint."""
+    mechanism = MECHANISMS[structure.mechanism]
+    own = {
+        x.name: numbers[f"{OWN_MECHANISMS}.{mechanism.name}.{x.name}"] for x in mechanism.parameters
+    }
+    machine = {
+        "guide_side": numbers["machine.guide_side"],
+        "guide_angle": xp.radians(numbers["machine.guide_angles_deg"]),
+        "guide_offset": numbers["machine.guide_offsets"],
+        "joint_radius": numbers["machine.joint_radius"],
+        "joint_angle": _joint_angle(numbers, xp),
+        "slider_mass": numbers["machine.slider_mass"],
+    }
+    return mechanism.build(own, machine, xp)
 
 
 def _bridge(numbers: Numbers) -> Any:

@@ -13,6 +13,8 @@ from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import DriveLaw
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law
+from jaxmodel.mechanisms import MECHANISMS
+from jaxmodel.mechanisms.contract import Mechanism
 from jaxmodel.piezo import VACUUM_PERMITTIVITY
 from jaxmodel.table import Table
 from studies.errors import field_error, nearest, shown
@@ -75,6 +77,11 @@ def check_consistency(study: Study) -> None:
     _check_lists(study)
     _check_own_fields("control.laws", control.laws, LAWS)
     _check_own_fields("drive.kinds", study.drive.kinds, DRIVES)
+    _check_own_fields("machine.kinds", study.machine.kinds, MECHANISMS)
+    count = len(control.links)
+    if MECHANISMS[study.machine.kind].n_links != count:
+        allowed = [name for name, x in MECHANISMS.items() if x.n_links == count]
+        raise field_error("machine.kind", study.machine.kind, ", ".join(allowed))
     _check_basis(study)
     _check_stations(study)
     _check_sampling(study)
@@ -160,9 +167,11 @@ def _largest(value: Any) -> float:
 
 
 def _check_own_fields(
-    place: str, written: dict[str, dict[str, Any]], table: Table[Law] | Table[DriveLaw]
+    place: str,
+    written: dict[str, dict[str, Any]],
+    table: Table[Law] | Table[DriveLaw] | Table[Mechanism],
 ) -> None:
-    """Check own fields of laws or drives; a sweep can include those that are not selected."""
+    """Check own fields of laws and their like; a sweep can include those that are not selected."""
     for name, fields in written.items():
         path = f"{place}.{name}"
         if name not in table:

@@ -21,9 +21,10 @@ from jaxmodel.case import Structure
 from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.state_space import STATE_SPACE
+from jaxmodel.mechanisms import MECHANISMS
 from studies.study.fields import Columns, Fields, nesting
 from studies.study.paths import LINKS, all_fields, field_choices, own_fields, own_place, parse_entry
-from studies.study.spec import OWN_DRIVES, OWN_LAWS, Study
+from studies.study.spec import OWN_DRIVES, OWN_LAWS, OWN_MECHANISMS, Study
 from studies.study.state_space import system_of
 from studies.study.window import DELAY, residual_delay
 
@@ -90,6 +91,7 @@ def study_numbers(study: Study, structure: Structure, columns: Columns | None = 
     own = [
         *own_fields(OWN_LAWS, [LAWS[structure.law]]),
         *own_fields(OWN_DRIVES, [DRIVES[structure.drive]]),
+        *own_fields(OWN_MECHANISMS, [MECHANISMS[structure.mechanism]]),
     ]
     numbers |= {name: fields.each_link(name) for name in own}
     # "auto" is that of the study without columns

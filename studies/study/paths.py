@@ -18,11 +18,14 @@ from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import DriveLaw
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law
+from jaxmodel.mechanisms import MECHANISMS
+from jaxmodel.mechanisms.contract import Mechanism
+from jaxmodel.mechanisms.prrr import PRRR
 from jaxmodel.table import Parameter
 from studies.errors import StudyError, nearest, shown
 from studies.study.consistency import check_consistency
 from studies.study.explain import choices_of, explain, unit_of
-from studies.study.spec import OWN_DRIVES, OWN_FIELDS, OWN_LAWS, Study
+from studies.study.spec import OWN_DRIVES, OWN_FIELDS, OWN_LAWS, OWN_MECHANISMS, Study
 
 LINKS = 3
 #: An index that names its axis and counts from 1, as in the files: `residual_rms[link=1]`.
@@ -48,19 +51,22 @@ class Parts(NamedTuple):
 
     law: str  # of LAWS
     drive: str  # of DRIVES
+    mechanism: str = PRRR.name  # of MECHANISMS
 
     def owns(self, field: str) -> bool:
-        """Whether a field is none of a law or drive that is not among these."""
+        """Whether a field is none of a law, drive or mechanism that is not among these."""
         place = own_place(field)
-        name = self.law if place == OWN_LAWS else self.drive
-        return not place or field.startswith(f"{place}.{name}.")
+        names = {OWN_LAWS: self.law, OWN_DRIVES: self.drive, OWN_MECHANISMS: self.mechanism}
+        return not place or field.startswith(f"{place}.{names[place]}.")
 
 
 def parts_of(study: Study, changed: Mapping[str, Any] | None = None) -> Parts:
-    """Law and drive of a study, with other values of some fields."""
+    """Law, drive and mechanism of a study, with other values of some fields."""
     changed = changed or {}
     return Parts(
-        changed.get("control.law", study.control.law), changed.get("drive.kind", study.drive.kind)
+        law=changed.get("control.law", study.control.law),
+        drive=changed.get("drive.kind", study.drive.kind),
+        mechanism=changed.get("machine.kind", study.machine.kind),
     )
 
 
@@ -92,8 +98,8 @@ def all_fields() -> list[str]:
     return names
 
 
-def own_fields(place: str, entries: Iterable[Law | DriveLaw]) -> list[str]:
-    """Own fields of laws or drives.
+def own_fields(place: str, entries: Iterable[Law | DriveLaw | Mechanism]) -> list[str]:
+    """Own fields of laws, drives or mechanisms.
 
     Args:
         place: in `OWN_FIELDS`.
@@ -103,12 +109,12 @@ def own_fields(place: str, entries: Iterable[Law | DriveLaw]) -> list[str]:
 
 
 def own_place(field: str) -> str:
-    """Place in `OWN_FIELDS` of an own field of a law or drive, "" for other fields."""
+    """Place in `OWN_FIELDS` of an own field of a law and its like, "" for other fields."""
     return next((place for place in OWN_FIELDS if field.startswith(f"{place}.")), "")
 
 
 def own_parameter(field: str) -> Parameter | None:
-    """The parameter of a law or drive behind a field, if there is one."""
+    """The parameter of a law and its like behind a field, if there is one."""
     place = own_place(field)
     if not place:
         return None
@@ -162,9 +168,10 @@ def free_fields(parts: Iterable[Parts], *roles: str) -> tuple[str, ...]:
         for leaf, info in getattr(outer.annotation, "model_fields", {}).items()
         if isinstance(info.json_schema_extra, dict) and info.json_schema_extra.get("free") in roles
     ]
-    laws, drives = (dict.fromkeys(x) for x in zip(*parts, strict=True))
+    laws, drives, mechanisms = (dict.fromkeys(x) for x in zip(*parts, strict=True))
     own = own_fields(OWN_LAWS, [LAWS[name] for name in laws])
-    return (*names, *own, *own_fields(OWN_DRIVES, [DRIVES[name] for name in drives]))
+    own += own_fields(OWN_DRIVES, [DRIVES[name] for name in drives])
+    return (*names, *own, *own_fields(OWN_MECHANISMS, [MECHANISMS[name] for name in mechanisms]))
 
 
 def as_list(field: str, value: Any) -> Any:

@@ -20,6 +20,8 @@ from jaxmodel.estimator import KINDS
 from jaxmodel.hysteresis import WIDEST
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law
+from jaxmodel.mechanisms import MECHANISMS
+from jaxmodel.mechanisms.contract import Mechanism
 from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.motion import PROFILES
 from jaxmodel.shaper import SHAPERS
@@ -31,9 +33,13 @@ from studies.study.explain import explain
 from studies.study.files import READY, read_toml
 from studies.study.state_space import with_matrices
 
-#: Where the own fields of control laws and drives are, `PLACE.NAME.FIELD`.
-OWN_LAWS, OWN_DRIVES = "control.laws", "drive.kinds"
-OWN_FIELDS: dict[str, Table[Law] | Table[DriveLaw]] = {OWN_LAWS: LAWS, OWN_DRIVES: DRIVES}
+#: Where the own fields of control laws, drives and mechanisms are, `PLACE.NAME.FIELD`.
+OWN_LAWS, OWN_DRIVES, OWN_MECHANISMS = "control.laws", "drive.kinds", "machine.kinds"
+OWN_FIELDS: dict[str, Table[Law] | Table[DriveLaw] | Table[Mechanism]] = {
+    OWN_LAWS: LAWS,
+    OWN_DRIVES: DRIVES,
+    OWN_MECHANISMS: MECHANISMS,
+}
 Basis = Annotated[str, OneOf(lambda: BASES)]
 #: Value of `metrics.residual_delay` that leaves the number to `studies.study.window`.
 AUTO = "auto"
@@ -66,7 +72,7 @@ EachMode: TypeAlias = EachLink[Number] | tuple[()] | tuple[tuple[Number, ...], .
 
 
 class OwnFields:
-    """Annotation of `control.laws` and `drive.kinds`: describes what they can hold."""
+    """Annotation of `control.laws` and its like: describes what they can hold."""
 
     def __init__(self, place: str) -> None:
         """
@@ -114,8 +120,14 @@ class RunSection(Section):
 
 
 class MachineSection(Section):
-    """Guides, platform, sliders."""
+    """Mechanism, guides, platform, sliders."""
 
+    kind: Annotated[str, OneOf(lambda: MECHANISMS, OWN)] = described(
+        "prrr", "-", "mechanism; prrr: sliders on guides, rrr: cranks"
+    )
+    kinds: Annotated[dict[str, dict[str, EachLink[float]]], OwnFields(OWN_MECHANISMS)] = described(
+        {}, "-", "fields of the mechanisms, by kind"
+    )
     guide_side: float = described(
         0.6, "m", "side of the guide triangle", ge=0.01, le=10, free=MACHINE
     )

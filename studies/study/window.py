@@ -15,9 +15,9 @@ import numpy as np
 from jaxmodel.case import Drive
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import SliderError
-from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES
 from studies.errors import StudyError, field_error
 from studies.study.consistency import each_link
+from studies.study.geometry import machine_geometry
 from studies.study.spec import AUTO, Study
 
 #: The field.
@@ -34,6 +34,8 @@ PULSE_TIMES = (
     "load.pulse_start",
     "load.pulse_length",
 )
+#: Cosine of a link's angle to the path, at least, where a pose is out of reach [1].
+FLATTEST = 0.045
 #: A drive that takes longer never settles [s].
 LONGEST = 100.0
 
@@ -214,36 +216,35 @@ def rigid_machine(study: Study) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         M of the pose (x, y, phi) [kg, kg m, kg m2], (3, 3); J = d rho / d pose [1, 1, m], (3, 3).
     """
-    machine, link = study.machine, study.link
-    x, y, phi = study.motion.waypoints[-1]
-    guide = np.radians(machine.guide_angles_deg)
-    along = np.stack([np.cos(guide), np.sin(guide)], axis=1)
-    inwards = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    body = np.radians(machine.joint_angles_deg) if machine.joint_angles_deg else None
-    angle = phi + (np.array(ASSEMBLIES[machine.assembly]) if body is None else body)
-    radius = each_link(machine.joint_radius)
-    arm = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    link, pose = study.link, study.motion.waypoints[-1]
+    geometry, near_mass = machine_geometry(study)
+    length = each_link(link.length)
+    legs, (arm_x, arm_y) = geometry.legs(np), geometry.arms(np)
+    sine_phi, cosine_phi = np.sin(pose[2]), np.cos(pose[2])
+    arm = np.stack(
+        [arm_x * cosine_phi - arm_y * sine_phi, arm_y * cosine_phi + arm_x * sine_phi], axis=1
+    )
+    far = np.array(pose[:2]) + arm
+    # an unreachable pose has a message of its own
+    near = legs.near(far[:, 0], far[:, 1], length**2, (FLATTEST * length) ** 2, np)
+    u = np.stack([near.x, near.y], axis=1)
+    n = np.stack([-u[:, 1], u[:, 0]], axis=1)
+    sine, cosine = near.across / length, near.root / length
     # rate of each joint C_i by (x, y, phi), (3, 2, 3)
     joint = np.concatenate(
         [np.tile(np.eye(2), (3, 1, 1)), np.stack([-arm[:, 1], arm[:, 0]], axis=1)[:, :, None]],
         axis=2,
     )
-    length = each_link(link.length)
-    # distance of the guide from the centre of the triangle
-    inradius = machine.guide_side / (2 * np.sqrt(3)) + each_link(machine.guide_offsets)
-    height = np.sum(inwards * (np.array([x, y]) + arm), axis=1) + inradius
-    sine = np.clip(height / length, 0.0, 0.999)  # an unreachable pose has a message of its own
-    cosine = np.sqrt(1 - sine**2)
-    by_height = np.einsum("ij,ijk->ik", inwards, joint)
+    by_height = np.einsum("ij,ijk->ik", n, joint)
     turn = by_height / (length * cosine)[:, None]
-    rates = np.einsum("ij,ijk->ik", along, joint) + (sine / cosine)[:, None] * by_height
+    rates = np.einsum("ij,ijk->ik", u, joint) + (sine / cosine)[:, None] * by_height
     mass = each_link(link.density) * each_link(link.width) * each_link(link.thickness) * length
-    carried = each_link(machine.slider_mass) + mass
+    carried = near_mass + mass
     coupling = mass * length / 2 * sine
     inertia = np.einsum("i,ij,ik->jk", carried, rates, rates)
     inertia += np.einsum("i,ij,ik->jk", mass * length**2 / 3, turn, turn)
     mixed = np.einsum("i,ij,ik->jk", coupling, rates, turn)
-    inertia += _platform(study, phi) - mixed - mixed.T
+    inertia += _platform(study, pose[2]) - mixed - mixed.T
     return inertia, rates
 
 

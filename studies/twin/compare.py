@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.beam import BASES
+from jaxmodel.mechanisms.prrr import PRRR
 from studies.engine.controller import check_codable
 from studies.engine.preflight import check_run
 from studies.engine.runs import Run, run_study, uncontrolled_twin
@@ -100,6 +101,8 @@ def check_supported(study: Study) -> None:
     if study.patches.hysteresis > 0:
         hysteresis = study.patches.hysteresis
         raise field_error("patches.hysteresis", hysteresis, "0 for studies twin", "1")
+    if study.machine.kind != PRRR.name:
+        raise field_error("machine.kind", study.machine.kind, f"{PRRR.name} for studies twin")
     if not BASES[link.basis].is_on_chord:
         names = ", ".join(name for name, one in BASES.items() if one.is_on_chord)
         raise field_error("link.basis", link.basis, f"{names} for studies twin")

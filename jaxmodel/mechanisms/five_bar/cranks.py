@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from jaxmodel.lazy import jnp
 from jaxmodel.mechanisms.rrr.cranks import Cranks
 from jaxmodel.parameters import Array
+from jaxmodel.table import Parameter
 
 
 class FiveBarGeometry(NamedTuple):
@@ -17,18 +20,47 @@ class FiveBarGeometry(NamedTuple):
     elbow: Array  # 1 or -1, see `Cranks`, (2,)
     zero_angle: Array  # direction of a crank at rho = 0 [rad], (2,)
 
-    def arms(self) -> None:
+    def arms(self, xp: Any = jnp) -> None:
         """The links meet in a point."""
 
-    def legs(self) -> Cranks:
+    def size(self) -> float:
+        """Distance of the pivots, or reach."""
+        return float(np.max(self.pivot_distance) + 2 * np.max(self.crank_length))
+
+    def carriers(self, near: np.ndarray) -> np.ndarray:
+        """The cranks, from pivot to link."""
+        pivots = np.array([[-0.5, 0.0], [0.5, 0.0]]) * self.pivot_distance
+        return np.stack([pivots, near], axis=1)
+
+    def legs(self, xp: Any = jnp) -> Cranks:
         """A_1 on the left, A_2 on the right."""
-        zero = jnp.asarray(self.zero_angle)
-        half = jnp.asarray(self.pivot_distance) / 2
+        zero = xp.asarray(self.zero_angle)
+        half = xp.asarray(self.pivot_distance) / 2
         return Cranks(
-            x=jnp.stack([-half, half]),
-            y=jnp.zeros(2),
-            length=jnp.broadcast_to(jnp.asarray(self.crank_length), zero.shape),
-            elbow=jnp.asarray(self.elbow),
-            zero_x=jnp.cos(zero),
-            zero_y=jnp.sin(zero),
+            x=xp.stack([-half, half]),
+            y=xp.zeros(2),
+            length=xp.broadcast_to(xp.asarray(self.crank_length), zero.shape),
+            elbow=xp.asarray(self.elbow),
+            zero_x=xp.cos(zero),
+            zero_y=xp.sin(zero),
         )
+
+
+PARAMETERS = (
+    Parameter("pivot_distance", 0.2, "m", "from one pivot to the other", 0.01, 10.0),
+    Parameter("crank_length", 0.16, "m", "of the crank", 1e-3, 10.0),
+    Parameter("crank_inertia", 4e-3, "kg m2", "of crank and motor about the pivot", 1e-8, 1e3),
+)
+
+
+def build(
+    own: dict[str, Array], machine: dict[str, Array], xp: Any
+) -> tuple[FiveBarGeometry, Array]:
+    """Elbows point outwards; rho = 0 where a crank points up."""
+    length = own["crank_length"]
+    return FiveBarGeometry(
+        pivot_distance=own["pivot_distance"],
+        crank_length=length,
+        elbow=xp.asarray([-1.0, 1.0]),
+        zero_angle=xp.asarray([np.pi / 2, np.pi / 2]),
+    ), own["crank_inertia"] / length**2

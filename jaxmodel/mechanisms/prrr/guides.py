@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,12 +29,12 @@ class Guides(NamedTuple):
         """A link along its guide is about to change to the other side of it."""
         return gamma
 
-    def near(self, x: Array, y: Array, squared: Array, floor: Array) -> Near:
+    def near(self, x: Array, y: Array, squared: Array, floor: Array, xp: Any = jnp) -> Near:
         """P = sqrt(l2 - h^2), rho = s - P."""
         s = self.ux * x + self.uy * y + self.s0
         h = self.ux * y - self.uy * x + self.h0
         root_squared = squared - h * h
-        root = safe_root(root_squared, floor)
+        root = safe_root(root_squared, floor, xp)
         return Near(
             x=self.ux,
             y=self.uy,
@@ -54,20 +54,38 @@ class GuideGeometry(NamedTuple):
     joint_angle: Array  # psi, body angle of C_i [rad], (3,)
     guide_offset: Array = 0.0  # how much further from O than the side a guide lies [m], () or (3,)
 
-    def arms(self) -> tuple[Array, Array]:
+    def arms(self, xp: Any = jnp) -> tuple[Array, Array]:
         """Joints C_i in the platform's axes."""
-        return polar(self.joint_radius, self.joint_angle)
+        return polar(self.joint_radius, self.joint_angle, xp)
 
-    def legs(self) -> Guides:
+    def size(self) -> float:
+        """Side of the triangle."""
+        return float(self.guide_side)
+
+    def carriers(self, near: np.ndarray) -> np.ndarray:
+        """The guides, from corner to corner of the triangle."""
+        guides = self.legs(np)
+        u = np.stack([guides.ux, guides.uy], axis=1)
+        n = np.stack([-guides.uy, guides.ux], axis=1)
+        corner = -guides.h0[:, None] * n - guides.s0[:, None] * u
+        return np.stack([corner, corner + self.size() * u], axis=1)
+
+    def legs(self, xp: Any = jnp) -> Guides:
         """A_i = -r_i n_i - (a/2) u_i, r_i = a/(2 sqrt 3) + the guide's offset."""
-        angle = jnp.asarray(self.guide_angle)
+        angle = xp.asarray(self.guide_angle)
 
         def link(x: Array) -> Array:
-            return jnp.broadcast_to(jnp.asarray(x), angle.shape)
+            return xp.broadcast_to(xp.asarray(x), angle.shape)
 
         return Guides(
-            ux=jnp.cos(angle),
-            uy=jnp.sin(angle),
+            ux=xp.cos(angle),
+            uy=xp.sin(angle),
             s0=link(self.guide_side / 2),
-            h0=link(self.guide_side / jnp.sqrt(12.0) + self.guide_offset),
+            h0=link(self.guide_side / xp.sqrt(12.0) + self.guide_offset),
         )
+
+
+def build(own: dict[str, Array], machine: dict[str, Array], xp: Any) -> tuple[GuideGeometry, Array]:
+    """All of its numbers are those of `[machine]`."""
+    names = GuideGeometry._fields
+    return GuideGeometry(**{name: machine[name] for name in names}), machine["slider_mass"]

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from jaxmodel.lazy import jnp
 from jaxmodel.mechanisms.contract import Near, polar, safe_root
 from jaxmodel.parameters import Array
+from jaxmodel.table import Parameter
+from jaxmodel.trigonometry import angle_of
 
 #: Keeps a far joint from being on a pivot [m2].
 TINY_AREA = 1e-20
@@ -30,15 +34,15 @@ class Cranks(NamedTuple):
         """A link may stand at any angle to the path but across it, in line with the crank."""
         return jnp.ones_like(gamma)
 
-    def near(self, x: Array, y: Array, squared: Array, floor: Array) -> Near:
+    def near(self, x: Array, y: Array, squared: Array, floor: Array, xp: Any = jnp) -> Near:
         """With D = C - A, along the crank k = (D^2 + a^2 - l2)/(2 a) and P = sqrt(D^2 - k^2)."""
         far_x, far_y = x - self.x, y - self.y
         far = far_x * far_x + far_y * far_y
         k = (far + self.length * self.length - squared) / (2 * self.length)
         root_squared = far - k * k
-        root = safe_root(root_squared, floor)
+        root = safe_root(root_squared, floor, xp)
         left = self.elbow * root  # of D from the crank
-        scale = 1 / jnp.maximum(far, TINY_AREA)
+        scale = 1 / xp.maximum(far, TINY_AREA)
         crank_x = scale * (k * far_x + left * far_y)
         crank_y = scale * (k * far_y - left * far_x)
         turned_x = self.zero_x * crank_x + self.zero_y * crank_y
@@ -50,7 +54,7 @@ class Cranks(NamedTuple):
             root=root,
             root_squared=root_squared,
             across=self.elbow * (self.length - k),
-            position=arc * jnp.arctan2(turned_y, turned_x),
+            position=arc * angle_of(turned_x, turned_y, xp),
             curvature=1 / arc,
         )
 
@@ -66,23 +70,57 @@ class CrankGeometry(NamedTuple):
     joint_radius: Array  # distance platform centre - C_i [m], () or (n,)
     joint_angle: Array  # body angle of C_i [rad], (n,)
 
-    def arms(self) -> tuple[Array, Array]:
+    def arms(self, xp: Any = jnp) -> tuple[Array, Array]:
         """Joints C_i in the platform's axes."""
-        return polar(self.joint_radius, self.joint_angle)
+        return polar(self.joint_radius, self.joint_angle, xp)
 
-    def legs(self) -> Cranks:
+    def size(self) -> float:
+        """Distance of opposite pivots."""
+        return 2 * float(np.max(self.pivot_radius))
+
+    def carriers(self, near: np.ndarray) -> np.ndarray:
+        """The cranks, from pivot to link."""
+        return np.stack([np.stack(polar(self.pivot_radius, self.pivot_angle, np), axis=1), near], 1)
+
+    def legs(self, xp: Any = jnp) -> Cranks:
         """A_i = r_i (cos, sin) of the pivot's direction."""
-        zero = jnp.asarray(self.zero_angle)
-        x, y = polar(self.pivot_radius, self.pivot_angle)
+        zero = xp.asarray(self.zero_angle)
+        x, y = polar(self.pivot_radius, self.pivot_angle, xp)
 
         def link(x: Array) -> Array:
-            return jnp.broadcast_to(jnp.asarray(x), zero.shape)
+            return xp.broadcast_to(xp.asarray(x), zero.shape)
 
         return Cranks(
             x=x,
             y=y,
             length=link(self.crank_length),
             elbow=link(self.elbow),
-            zero_x=jnp.cos(zero),
-            zero_y=jnp.sin(zero),
+            zero_x=xp.cos(zero),
+            zero_y=xp.sin(zero),
         )
+
+
+#: Directions of the pivots from O that `pivot_turn` counts from [deg].
+DIRECTIONS = (90.0, 210.0, 330.0)
+PARAMETERS = (
+    Parameter("pivot_radius", 0.3, "m", "distance of the pivot from the origin", 0.01, 10.0),
+    Parameter("pivot_turn", 0.0, "deg", "pivot's direction from 90, 210, 330 deg", -180.0, 180.0),
+    Parameter("crank_length", 0.16, "m", "of the crank", 1e-3, 10.0),
+    Parameter("crank_inertia", 4e-3, "kg m2", "of crank and motor about the pivot", 1e-8, 1e3),
+    Parameter("elbow", 1.0, "1", "1: the link lies to the left of the crank, -1: right", -1.0, 1.0),
+)
+
+
+def build(own: dict[str, Array], machine: dict[str, Array], xp: Any) -> tuple[CrankGeometry, Array]:
+    """rho = 0 where a crank points to the origin; inertia over a^2 is a mass at B."""
+    pivot = xp.radians(xp.asarray(DIRECTIONS) + own["pivot_turn"])
+    length = own["crank_length"]
+    return CrankGeometry(
+        pivot_radius=own["pivot_radius"],
+        pivot_angle=pivot,
+        crank_length=length,
+        elbow=xp.where(own["elbow"] < 0, -1.0, 1.0),
+        zero_angle=pivot + xp.pi,
+        joint_radius=machine["joint_radius"],
+        joint_angle=machine["joint_angle"],
+    ), own["crank_inertia"] / length**2
