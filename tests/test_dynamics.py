@@ -1,6 +1,5 @@
 """Dynamics against the Lagrangian, the multiplier form and the paper's geometry."""
 
-from functools import partial
 from itertools import pairwise
 
 import jax
@@ -9,32 +8,13 @@ import numpy as np
 import pytest
 
 from jaxmodel import dynamics, kinematics, status
-from jaxmodel.beam import build_basis
 from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES
-from jaxmodel.mechanisms.prrr.paper import HOME, paper_machine
-from jaxmodel.plant import build_plant
+from jaxmodel.mechanisms.prrr.paper import HOME
 from studies.reference import lagrangian as reference
+from tests.forms import MACHINE, R, all_forms, check_forms, make
 
-MACHINE = paper_machine()
-R = 3
 HOME_POSE = np.array(HOME)
 N_STATES = 100
-
-
-@partial(jax.jit, static_argnums=0)
-def build(kind, machine, mask, stations):
-    basis = build_basis(kind, machine.beam, machine.patches, R, stations, mask)
-    return basis, build_plant(machine, basis, is_distributed=True)
-
-
-def make(kind, machine=MACHINE, mask=1.0, stations=(0.1,), shortening="lumped"):
-    """Basis and plant as plain arrays."""
-    made = jax.tree.map(np.asarray, build(kind, machine, mask, np.array(stations)))
-    if shortening != "distributed":
-        made = tuple(part._replace(inward=None, centrifugal=None) for part in made)
-    if shortening == "none":
-        made = tuple(part._replace(shortening=None, mixed_shortening=None) for part in made)
-    return made
 
 
 #: Bases, and how a bent link's mass moves inwards.
@@ -69,33 +49,12 @@ def closed_form(plant, motion, loads):
     return reference.closed_form(plant, motion, loads)[1]
 
 
-@jax.jit
-@partial(jax.vmap, in_axes=(None, None, 0, 0))
-def all_forms(basis, plant, motion, loads):
-    return (
-        closed_form(plant, motion, loads),
-        reference.by_lagrangian(MACHINE, basis, motion, loads),
-        reference.by_multipliers(MACHINE, basis, motion, loads),
-    )
-
-
 @pytest.mark.parametrize(("kind", "shortening"), KINDS)
 def test_accelerations_equal_lagrangian_and_multiplier_form(kind, shortening, states):
     basis, plant = make(kind, shortening=shortening)
 
-    found, (pose_l, q_l), (pose_m, q_m, rho_m, beta_m) = all_forms(basis, plant, *states)
-    pairs = (
-        (found.pose, pose_l),
-        (found.modal, q_l),
-        (found.pose, pose_m),
-        (found.modal, q_m),
-        (found.rho, rho_m),
-        (found.beta, beta_m),
-    )
-    for mine, wanted in pairs:
-        axes = tuple(range(1, wanted.ndim))
-        error = np.abs(mine - wanted).max(axis=axes) / np.abs(wanted).max(axis=axes)
-        assert error.max() < 1e-10
+    (_, found), lagrangian, multipliers = all_forms(MACHINE, basis, plant, *states)
+    check_forms(found, lagrangian, multipliers)
     oscillator = plant.stiffness * states[0].q + plant.damping * states[0].q_rate
     oscillator = oscillator / plant.modal_mass[:, None]
     np.testing.assert_allclose(
@@ -175,7 +134,7 @@ def test_a_dropped_term_of_the_shortening_would_be_noticed(states):
     """The comparison with the Lagrangian must fail for a model without the mass that moves in."""
     basis, plant = make("pinned_pinned")
     still = plant._replace(tip_mass=plant.tip_mass * (1 - 1e-6))
-    found, (pose, _), _ = all_forms(basis, still, *states)
+    (_, found), (pose, _), _ = all_forms(MACHINE, basis, still, *states)
     assert np.abs(found.pose - pose).max() > 1e-9 * np.abs(pose).max()
 
 

@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 
 from jaxmodel import kinematics, status
-from jaxmodel.beam import build_basis
 from jaxmodel.case import uncontrolled
 from jaxmodel.frequency_response import plant_response
 from jaxmodel.linear import linearise
 from jaxmodel.mechanisms.five_bar.cranks import FiveBarGeometry
 from jaxmodel.mechanisms.prrr.paper import paper_machine
 from jaxmodel.mechanisms.rrr.cranks import CrankGeometry
-from jaxmodel.plant import build_plant
 from jaxmodel.prepare import prepare
 from jaxmodel.simulate import simulate
 from studies.engine.runs import run_study
@@ -25,9 +23,10 @@ from studies.space.spec import parse_sweep
 from studies.study.cases import build_case, build_structure
 from studies.study.spec import paper_study, parse_study
 from studies.study.window import rigid_machine
+from tests.forms import R, all_forms, check_forms, make
 from tests.test_kernel import both, check_equal
 
-R, N_STATES = 3, 100
+N_STATES = 100
 #: A 3-RRR: pivots on a circle, links as the paper's.
 CRANKS = CrankGeometry(
     pivot_radius=0.30,
@@ -70,22 +69,6 @@ KINDS = [
 ]
 
 
-@partial(jax.jit, static_argnums=0)
-def build(kind, machine):
-    basis = build_basis(kind, machine.beam, machine.patches, R, np.array([0.1]), 1.0)
-    return basis, build_plant(machine, basis, is_distributed=True)
-
-
-def make(kind, machine, shortening):
-    """Basis and plant as plain arrays."""
-    made = jax.tree.map(np.asarray, build(kind, machine))
-    if shortening != "distributed":
-        made = tuple(part._replace(inward=None, centrifugal=None) for part in made)
-    if shortening == "none":
-        made = tuple(part._replace(shortening=None, mixed_shortening=None) for part in made)
-    return made
-
-
 def states(machine):
     """Random states far from rest."""
     n = len(machine.patches.center)
@@ -102,37 +85,14 @@ def states(machine):
     )
 
 
-@jax.jit
-@partial(jax.vmap, in_axes=(None, None, None, 0, 0))
-def all_forms(machine, basis, plant, motion, loads):
-    return (
-        reference.closed_form(plant, motion, loads),
-        reference.by_lagrangian(machine, basis, motion, loads),
-        reference.by_multipliers(machine, basis, motion, loads),
-    )
-
-
 @pytest.mark.parametrize("name", MACHINES)
 @pytest.mark.parametrize(("kind", "shortening"), KINDS)
 def test_accelerations_equal_lagrangian_and_multiplier_form(name, kind, shortening):
     machine = MACHINES[name]
-    basis, plant = make(kind, machine, shortening)
-    (chain, found), (pose_l, q_l), (pose_m, q_m, rho_m, beta_m) = all_forms(
-        machine, basis, plant, *states(machine)
-    )
+    basis, plant = make(kind, machine, shortening=shortening)
+    (chain, found), lagrangian, multipliers = all_forms(machine, basis, plant, *states(machine))
     assert np.all(jax.vmap(partial(kinematics.chain_status, plant))(chain) == status.OK)
-    pairs = (
-        (found.pose, pose_l),
-        (found.modal, q_l),
-        (found.pose, pose_m),
-        (found.modal, q_m),
-        (found.rho, rho_m),
-        (found.beta, beta_m),
-    )
-    for mine, wanted in pairs:
-        axes = tuple(range(1, wanted.ndim))
-        error = np.abs(mine - wanted).max(axis=axes) / np.abs(wanted).max(axis=axes)
-        assert error.max() < 1e-10
+    check_forms(found, lagrangian, multipliers)
 
 
 # --- the sampled loop -----------------------------------------------------------------------------

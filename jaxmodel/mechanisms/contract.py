@@ -85,6 +85,12 @@ class Legs(Protocol):
             xp: NumPy or `jax.numpy`.
         """
 
+    def carriers(self, near: np.ndarray) -> np.ndarray:
+        """Lines of what carries the near joints [m], (n, 2, 2), for a drawing; NumPy numbers.
+
+        near: places of the near joints [m], (n, 2).
+        """
+
 
 class Geometry(Protocol):
     """Numbers that describe a mechanism: a NamedTuple of arrays."""
@@ -97,12 +103,6 @@ class Geometry(Protocol):
 
     def size(self) -> float:
         """How large it is [m]; NumPy numbers."""
-
-    def carriers(self, near: np.ndarray) -> np.ndarray:
-        """Lines of what carries the near joints [m], (n, 2, 2), for a drawing.
-
-        near: places of the near joints [m], (n, 2).
-        """
 
 
 def polar(radius: Array, angle: Array, xp: Any) -> tuple[Array, Array]:

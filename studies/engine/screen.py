@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.case import Structure
-from jaxmodel.metrics import METRICS, Sizes
+from jaxmodel.metrics import METRICS
 from studies.engine.chunks import Done
 from studies.engine.columns import PER_CASE, SCREENED, labelled
 from studies.engine.folder import SCREEN, Finished, finished_cases
@@ -26,7 +26,7 @@ from studies.errors import StudyError, nearest
 from studies.space.condition import evaluate
 from studies.space.spec import Screen, SweepSpec
 from studies.space.table import CaseTable
-from studies.study.entries import parse_entries
+from studies.study.entries import entry_sizes, parse_entries
 from studies.study.paths import NAMED_INDEX
 
 #: Most random cases that show what the screen lost.
@@ -56,14 +56,10 @@ def check_screen_names(spec: SweepSpec, table: CaseTable) -> None:
     if spec.screen is None:
         return
     metrics = kept_metrics(spec)
-    sizes = Sizes(
-        n_stations=len(spec.study.metrics.stations),
-        n_modes=int(table.values("link.modes").max()),
-        n_controlled=int(table.values("control.modes").max()),
-        n_frequencies=Structure().n_frequencies,
-        n_links=Structure().n_links,
-        n_pose=Structure().n_pose,
-    ).axes
+    sizes = entry_sizes(spec.study) | {
+        "mode": int(table.values("link.modes").max()),
+        "controlled_mode": int(table.values("control.modes").max()),
+    }
     parse_entries(spec.screen.entry, "sweep.screen.by", sizes)
 
     def lookup(name: str) -> np.ndarray:

@@ -246,7 +246,7 @@ def _check_rest(rest: np.ndarray, step: float, path: str) -> None:
 def _jackknifed(
     blocks: np.ndarray, modes: RingingPoles, step: float, band: tuple[float, float], path: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same of ambient records, by the scatter without one block each."""
+    """`refined` of ambient records; deviations by the scatter without one block each."""
     whole, count = blocks.sum(axis=0), len(blocks)
     value, *_ = refined(whole / count, modes, step, band, path)
     tried = np.array(

@@ -177,11 +177,9 @@ def _of_links(spec: FitSpec, problem: Problem, u: np.ndarray) -> list[Remedy]:
         own = [getattr(spec.study.link, name)] * 3
         links = dict(spec.data.get(section, {})) | {name: own}
         try:
-            each = parse_fit(spec.data | {section: links}, spec.folder)
-            bench = make_bench(each)
+            apart = _problem_of(parse_fit(spec.data | {section: links}, spec.folder))
         except StudyError:  # the parameters have no place there
             continue
-        apart = make_problem(each, bench, make_measurements(each, bench))
         place = dict(zip(problem.free.names, u, strict=True))
         at = np.array([place.get(x, place.get(x.partition("[")[0])) for x in apart.free.names])
         starts = [np.clip(at + SPREAD * turn, 1e-9, 1 - 1e-9) for turn in _spreads(apart, field)]
@@ -264,10 +262,14 @@ def _bounds(spec: FitSpec, field: str) -> dict[str, Any] | None:
     return None
 
 
+def _problem_of(spec: FitSpec) -> Problem:
+    bench = make_bench(spec)
+    return make_problem(spec, bench, make_measurements(spec, bench))
+
+
 def _wide_problem(whole: FitSpec, u: np.ndarray) -> tuple[Problem, np.ndarray]:
     """The problem with more free numbers, and the place in it where the fit ended."""
-    bench = make_bench(whole)
-    wide = make_problem(whole, bench, make_measurements(whole, bench))
+    wide = _problem_of(whole)
     at = whole.free.places()
     at[: len(u)] = u
     values = whole.free.values(at)

@@ -15,7 +15,7 @@ ORDERS = range(2, 62, 2)
 #: Poles are the same where frequency [1] and damping ratio [1] differ by less, and shapes are
 #: as much alike (MAC) [1]; refinement moves them by up to so many times as much.
 SAME_FREQUENCY, SAME_DAMPING, SAME_SHAPE, MOVED = 0.005, 0.003, 0.95, 4.0
-#: RingingPoles of less and of more damping are no modes [1].
+#: Poles of less and of more damping are no modes [1].
 LEAST_DAMPED, MOST_DAMPED = 1e-6, 0.2
 #: Singular values below this share of the largest are rounding [1].
 EXACT = 1e-9
@@ -71,7 +71,7 @@ def _transition(seen: np.ndarray, c: int) -> np.ndarray:
 
 
 def find_orders(signals: np.ndarray, step: float, band: tuple[float, float]) -> list[RingingPoles]:
-    """RingingPoles within the band, order by order."""
+    """Poles within the band, order by order."""
     seen, c = _observability(signals)
     found: list[RingingPoles] = []
     for n in ORDERS:
@@ -91,7 +91,7 @@ def find_orders(signals: np.ndarray, step: float, band: tuple[float, float]) -> 
 
 
 def find_modes(orders: list[RingingPoles], often: float) -> tuple[RingingPoles, list[np.ndarray]]:
-    """RingingPoles that come again from order to order, and which of each order do.
+    """Poles that come again from order to order, and which of each order do.
 
     From the highest order down, stable poles are paired with those already found.
     """

@@ -44,7 +44,8 @@ def skeleton(study: Study, pose: np.ndarray, q: np.ndarray, exaggeration: float)
         np.asarray(part)
         for part in _positions(structure._replace(n_steps=1), case, pose, q, exaggeration)
     )
-    carrier = np.stack([case.machine.geometry.carriers(x) for x in slider])
+    legs = case.machine.geometry.legs(np)
+    carrier = np.stack([legs.carriers(x) for x in slider])
     return Skeleton(carrier, slider, joint, link)
 
 

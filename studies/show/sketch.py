@@ -13,7 +13,7 @@ from jaxmodel.case import Case
 from studies.show import figures
 from studies.study.cases import build_case
 from studies.study.consistency import each_link, patch_centers
-from studies.study.geometry import machine_geometry
+from studies.study.geometry import far_arms, machine_geometry
 from studies.study.spec import Study
 
 #: Colours of controlled links, other links, actuators and sensors.
@@ -70,16 +70,14 @@ def sketch(study: Study) -> Figure:
 def standing(case: Case, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Joints B and C [m] of straight links at a pose, (3, 2) each; NaN out of reach."""
     geometry, length = case.machine.geometry, each_link(case.machine.beam.length)
-    sine, cosine = np.sin(pose[2]), np.cos(pose[2])
-    x, y = geometry.arms(np)
-    joint = pose[:2] + np.stack([x * cosine - y * sine, y * cosine + x * sine], axis=1)
+    joint = pose[:2] + far_arms(geometry, pose[2])
     near = geometry.legs(np).near(*joint.T, length**2, 0.0, np)
     away = np.stack(near.to_far(), axis=1)
     return np.where(near.root_squared[:, None] < 0, np.nan, joint - away), joint
 
 
 def _carriers(ax: Axes, case: Case, near: np.ndarray) -> None:
-    for line in case.machine.geometry.carriers(near):
+    for line in case.machine.geometry.legs(np).carriers(near):
         ax.plot(*(1e3 * line.T), color="#BBBBBB", linewidth=3, zorder=0)
 
 

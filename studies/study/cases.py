@@ -28,13 +28,13 @@ from jaxmodel.case import (
 from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law
-from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES
 from jaxmodel.parameters import Beam, Damping, Machine, Masses, Patches
 from studies.study.consistency import patch_centers
 from studies.study.fields import Columns, Fields
+from studies.study.geometry import build_geometry
 from studies.study.numbers import Numbers, one_study, study_numbers
-from studies.study.spec import OWN_DRIVES, OWN_LAWS, OWN_MECHANISMS, Study
+from studies.study.spec import OWN_DRIVES, OWN_LAWS, Study
 
 Tree = TypeVar("Tree")  # a Case, or numbers
 TWO_PI = 2 * np.pi
@@ -205,7 +205,8 @@ def as_arrays(case: Tree) -> Tree:
 
 def _machine(numbers: Numbers, structure: Structure, xp: Any) -> Machine:
     number = numbers.__getitem__
-    geometry, near_mass = _geometry(numbers, structure, xp)
+    joint_angle = _joint_angle(numbers, xp)
+    geometry, near_mass = build_geometry(structure.mechanism, number, joint_angle, xp)
     return Machine(
         geometry=geometry,
         masses=Masses(
@@ -228,23 +229,6 @@ def _machine(numbers: Numbers, structure: Structure, xp: Any) -> Machine:
         ),
         damping=_damping(numbers, xp),
     )
-
-
-def _geometry(numbers: Numbers, structure: Structure, xp: Any) -> tuple[Any, Any]:
-    """The mechanism's geometry, and the mass that moves with each near joint."""
-    mechanism = MECHANISMS[structure.mechanism]
-    own = {
-        x.name: numbers[f"{OWN_MECHANISMS}.{mechanism.name}.{x.name}"] for x in mechanism.parameters
-    }
-    machine = {
-        "guide_side": numbers["machine.guide_side"],
-        "guide_angle": xp.radians(numbers["machine.guide_angles_deg"]),
-        "guide_offset": numbers["machine.guide_offsets"],
-        "joint_radius": numbers["machine.joint_radius"],
-        "joint_angle": _joint_angle(numbers, xp),
-        "slider_mass": numbers["machine.slider_mass"],
-    }
-    return mechanism.build(own, machine, xp)
 
 
 def _bridge(numbers: Numbers) -> Any:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxmodel.case import Structure
+from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.metrics import METRICS, Sizes
 from studies.errors import StudyError, nearest
 from studies.study.paths import LINKS, NAMED_INDEX, parse_entry
@@ -95,8 +96,8 @@ def entry_sizes(study: Study) -> dict[str, int]:
         n_modes=study.link.modes,
         n_controlled=study.control.modes,
         n_frequencies=Structure().n_frequencies,
-        n_links=Structure().n_links,
-        n_pose=Structure().n_pose,
+        n_links=MECHANISMS[study.machine.kind].n_links,
+        n_pose=MECHANISMS[study.machine.kind].n_pose,
     )
     return sizes.axes
 

@@ -1,7 +1,8 @@
-"""The geometry of a study's mechanism from its fields, without JAX."""
+"""The geometry of a study's mechanism, and where its platform's joints are, without JAX."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -9,22 +10,52 @@ import numpy as np
 from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES
 from studies.study.consistency import each_link
-from studies.study.spec import Study
+from studies.study.paths import field_value, own_fields
+from studies.study.spec import OWN_MECHANISMS, Study
+
+
+def build_geometry(
+    kind: str, number: Callable[[str], Any], joint_angle: Any, xp: Any
+) -> tuple[Any, Any]:
+    """`Geometry` of a mechanism, and the mass that moves with each near joint [kg].
+
+    Args:
+        kind: name of the mechanism.
+        number: value of a field in its unit.
+        joint_angle: of the platform's joints in its own axes [rad], (..., 3).
+        xp: NumPy or `jax.numpy`.
+    """
+    mechanism = MECHANISMS[kind]
+    own = {
+        name.rpartition(".")[2]: number(name) for name in own_fields(OWN_MECHANISMS, [mechanism])
+    }
+    machine = {
+        "guide_side": number("machine.guide_side"),
+        "guide_angle": xp.radians(number("machine.guide_angles_deg")),
+        "guide_offset": number("machine.guide_offsets"),
+        "joint_radius": number("machine.joint_radius"),
+        "joint_angle": joint_angle,
+        "slider_mass": number("machine.slider_mass"),
+    }
+    return mechanism.build(own, machine, xp)
 
 
 def machine_geometry(study: Study) -> tuple[Any, np.ndarray]:
-    """`Geometry` of the mechanism, and the mass that moves with each near joint [kg], (3,)."""
-    machine, mechanism = study.machine, MECHANISMS[study.machine.kind]
-    written = machine.kinds.get(mechanism.name, {})
-    own = {x.name: each_link(written.get(x.name, x.default)) for x in mechanism.parameters}
+    """The same of a study."""
+    machine = study.machine
     body = np.radians(machine.joint_angles_deg) if machine.joint_angles_deg else None
-    numbers = {
-        "guide_side": machine.guide_side,
-        "guide_angle": np.radians(machine.guide_angles_deg),
-        "guide_offset": each_link(machine.guide_offsets),
-        "joint_radius": each_link(machine.joint_radius),
-        "joint_angle": np.array(ASSEMBLIES[machine.assembly]) if body is None else body,
-        "slider_mass": each_link(machine.slider_mass),
-    }
-    geometry, near_mass = mechanism.build(own, numbers, np)
+    angle = np.array(ASSEMBLIES[machine.assembly]) if body is None else body
+
+    def number(name: str) -> Any:
+        value = field_value(study, name)
+        return value if name == "machine.guide_side" else each_link(value)
+
+    geometry, near_mass = build_geometry(machine.kind, number, angle, np)
     return geometry, np.asarray(near_mass)
+
+
+def far_arms(geometry: Any, phi: float) -> np.ndarray:
+    """Platform joints C from the reference point in the plane [m], (n, 2); phi [rad]."""
+    x, y = geometry.arms(np)
+    sine, cosine = np.sin(phi), np.cos(phi)
+    return np.stack([x * cosine - y * sine, y * cosine + x * sine], axis=1)

@@ -17,7 +17,7 @@ from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import SliderError
 from studies.errors import StudyError, field_error
 from studies.study.consistency import each_link
-from studies.study.geometry import machine_geometry
+from studies.study.geometry import far_arms, machine_geometry
 from studies.study.spec import AUTO, Study
 
 #: The field.
@@ -219,14 +219,10 @@ def rigid_machine(study: Study) -> tuple[np.ndarray, np.ndarray]:
     link, pose = study.link, study.motion.waypoints[-1]
     geometry, near_mass = machine_geometry(study)
     length = each_link(link.length)
-    legs, (arm_x, arm_y) = geometry.legs(np), geometry.arms(np)
-    sine_phi, cosine_phi = np.sin(pose[2]), np.cos(pose[2])
-    arm = np.stack(
-        [arm_x * cosine_phi - arm_y * sine_phi, arm_y * cosine_phi + arm_x * sine_phi], axis=1
-    )
+    arm = far_arms(geometry, pose[2])
     far = np.array(pose[:2]) + arm
     # an unreachable pose has a message of its own
-    near = legs.near(far[:, 0], far[:, 1], length**2, (FLATTEST * length) ** 2, np)
+    near = geometry.legs(np).near(*far.T, length**2, (FLATTEST * length) ** 2, np)
     u = np.stack([near.x, near.y], axis=1)
     n = np.stack([-u[:, 1], u[:, 0]], axis=1)
     sine, cosine = near.across / length, near.root / length

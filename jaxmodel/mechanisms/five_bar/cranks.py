@@ -27,11 +27,6 @@ class FiveBarGeometry(NamedTuple):
         """Distance of the pivots, or reach."""
         return float(np.max(self.pivot_distance) + 2 * np.max(self.crank_length))
 
-    def carriers(self, near: np.ndarray) -> np.ndarray:
-        """The cranks, from pivot to link."""
-        pivots = np.array([[-0.5, 0.0], [0.5, 0.0]]) * self.pivot_distance
-        return np.stack([pivots, near], axis=1)
-
     def legs(self, xp: Any = jnp) -> Cranks:
         """A_1 on the left, A_2 on the right."""
         zero = xp.asarray(self.zero_angle)

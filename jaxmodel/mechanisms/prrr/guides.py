@@ -44,6 +44,13 @@ class Guides(NamedTuple):
             position=s - root,
         )
 
+    def carriers(self, near: np.ndarray) -> np.ndarray:
+        """The guides, from corner to corner of the triangle."""
+        u = np.stack([self.ux, self.uy], axis=1)
+        n = np.stack([-self.uy, self.ux], axis=1)
+        middle, half = -self.h0[:, None] * n, self.s0[:, None] * u
+        return np.stack([middle - half, middle + half], axis=1)
+
 
 class GuideGeometry(NamedTuple):
     """Guides and platform joints. The paper's guides are the sides of a triangle around O."""
@@ -61,14 +68,6 @@ class GuideGeometry(NamedTuple):
     def size(self) -> float:
         """Side of the triangle."""
         return float(self.guide_side)
-
-    def carriers(self, near: np.ndarray) -> np.ndarray:
-        """The guides, from corner to corner of the triangle."""
-        guides = self.legs(np)
-        u = np.stack([guides.ux, guides.uy], axis=1)
-        n = np.stack([-guides.uy, guides.ux], axis=1)
-        corner = -guides.h0[:, None] * n - guides.s0[:, None] * u
-        return np.stack([corner, corner + self.size() * u], axis=1)
 
     def legs(self, xp: Any = jnp) -> Guides:
         """A_i = -r_i n_i - (a/2) u_i, r_i = a/(2 sqrt 3) + the guide's offset."""

@@ -58,6 +58,10 @@ class Cranks(NamedTuple):
             curvature=1 / arc,
         )
 
+    def carriers(self, near: np.ndarray) -> np.ndarray:
+        """The cranks, from pivot to link."""
+        return np.stack([np.stack([self.x, self.y], axis=1), near], axis=1)
+
 
 class CrankGeometry(NamedTuple):
     """Cranks about pivots on a circle around O, and platform joints."""
@@ -77,10 +81,6 @@ class CrankGeometry(NamedTuple):
     def size(self) -> float:
         """Distance of opposite pivots."""
         return 2 * float(np.max(self.pivot_radius))
-
-    def carriers(self, near: np.ndarray) -> np.ndarray:
-        """The cranks, from pivot to link."""
-        return np.stack([np.stack(polar(self.pivot_radius, self.pivot_angle, np), axis=1), near], 1)
 
     def legs(self, xp: Any = jnp) -> Cranks:
         """A_i = r_i (cos, sin) of the pivot's direction."""
