@@ -68,6 +68,7 @@ def _at_rest(study, pose):
 def _matrices(model):
     """Mass, damping, stiffness (n, n) and constraints' Jacobian (m, n) of all coordinates."""
     solver, settings = model.exudyn.MainSolverStatic(), model.exudyn.SimulationSettings()
+    settings.solution.file.write = False
     solver.InitializeSolver(model.system, settings)
     n = solver.GetODE2size()
     solver.ComputeMassMatrix(model.system)
