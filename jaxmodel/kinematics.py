@@ -16,13 +16,11 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.lazy import jax, jnp
-from jaxmodel.mechanisms.contract import Near
+from jaxmodel.mechanisms.contract import SINGULAR_MARGIN, Near
 from jaxmodel.parameters import Array
 from jaxmodel.plant import Plant
 from jaxmodel.trigonometry import sine_cosine
 
-#: sin and cos of gamma must exceed this: parallel or perpendicular to the guide is singular [1].
-SINGULAR_MARGIN = 1e-3
 #: Keeps the root of a joint's distance from the platform's centre away from 0 [m2].
 TINY_AREA = 1e-20
 

@@ -204,7 +204,7 @@ def _unknown(loop: ModalLoop, payload: float) -> _Unknown:
         known=count,
         sense=np.asarray(loop.steepest[0]),
         pull=np.asarray(loop.steepest[1]) / first**2,
-        enter=exist * float(np.max(sizes.enter * order)) * 3,  # three links
+        enter=exist * float(np.max(sizes.enter * order)) * len(sizes.enter),  # links add up
         leave=exist * float(np.max(sizes.leave * order)),
         omega=float(np.min(first)),
         resonance=max(1.2, float(np.max(1 / least_denominator(0.9 + 0 * zeta, zeta)))),
@@ -367,16 +367,17 @@ def _with_first_image(
 ) -> Tail:
     sizes, more = _sizes(loop, payload), unknown.known
     scale = pose_scale(loop, payload)
-    enter, leave = (np.abs(scale @ x) for x in (loop.enter, loop.leave))  # (3, 3, R)
+    enter, leave = (np.abs(scale @ x) for x in (loop.enter, loop.leave))  # (n, p, R)
     soft = high * first.answer / loop.omega**2
     seen = high * (first.remainder if loop.exact is not None else first.answer)
     x = np.asarray((0.5 + OVERLAP) * 2 * np.pi / float(loop.period) / unknown.omega / more**2)
     distance, size = _remainder(loop, unknown, x / np.sqrt(stiffness[0]), stiffness)
     compliance = np.einsum("ik,il->ikl", unknown.sense, unknown.pull) / more
     rare = 1 / (3 * more**3 * unknown.omega**2 * size)
-    by_pose = np.einsum("irk,ir,ipr->ikp", sizes.sense, soft, leave).reshape(-1, 3)
+    by_pose = np.einsum("irk,ir,ipr->ikp", sizes.sense, soft, leave)
+    by_pose = by_pose.reshape(-1, len(scale))
     by_voltage = np.einsum("ipr,ir,irk->pik", enter, high * first.answer, sizes.pull)
-    by_voltage = by_voltage.reshape(3, -1)
+    by_voltage = by_voltage.reshape(len(scale), -1)
     own = unknown.enter * unknown.leave / (5 * more**5 * unknown.omega**2 * size)
     return Tail(
         images=images,

@@ -22,7 +22,10 @@ WORST_CONDITION = 1e7
 
 
 class StateSpace(NamedTuple):
-    """G systems, 1 or 3: each has M = 3 K/G sensors, as many actuators and N blocks of b states."""
+    """G systems, one or one a link: each has N blocks of b states.
+
+    Each has M sensors and as many actuators: all n K of the machine, or the K of its link.
+    """
 
     state: Array  # A, (G, N, b, b)
     enter: Array  # B, state per sensor volt, (G, N, b, M)
@@ -31,29 +34,9 @@ class StateSpace(NamedTuple):
     anti_windup: Array | None = None  # E, state per volt that a limit adds, (G, N, b, M); None: 0
 
     @property
-    def acting(self) -> np.ndarray:
-        """It has no channels, (3, 0)."""
-        return np.zeros((3, 0), bool)
-
-    @property
-    def filter(self) -> np.ndarray:
-        """Of its channels, of which there are none, (3, 0, K)."""
-        return np.zeros((3, 0, self._n_patches))
-
-    @property
-    def synthesizer(self) -> np.ndarray:
-        """The same, (3, K, 0)."""
-        return np.zeros((3, self._n_patches, 0))
-
-    @property
     def has_output(self) -> bool:
         """Whether it does anything; NumPy arrays."""
         return bool(np.any(self.leave) or np.any(self.direct))
-
-    @property
-    def _n_patches(self) -> int:
-        groups, size = self.direct.shape[:2]
-        return int(groups * size // 3)
 
     def at_rest(self) -> Array:
         """State zero, (G, N, b)."""
@@ -64,10 +47,10 @@ class StateSpace(NamedTuple):
 
         Args:
             state: x, (G, N, b).
-            voltage: of the sensors [V], (3, K).
+            voltage: of the sensors [V], (n, K).
 
         Returns:
-            (next state, voltages wanted on the actuators [V], (3, K)).
+            (next state, voltages wanted on the actuators [V], (n, K)).
         """
         y = jnp.reshape(voltage, (state.shape[0], -1, *voltage.shape[2:]))
         after = jnp.sum(self.state * state[:, :, None], axis=3)
@@ -81,7 +64,7 @@ class StateSpace(NamedTuple):
 
         Args:
             state: from `step`.
-            change: of the voltages wanted, by limits [V], (3, K).
+            change: of the voltages wanted, by limits [V], (n, K).
         """
         if self.anti_windup is None:
             return state
@@ -89,13 +72,13 @@ class StateSpace(NamedTuple):
         return state + jnp.sum(self.anti_windup * volts[:, None, None], axis=3)
 
     def amplified(self, factor: Array) -> StateSpace:
-        """Outputs times a factor: one for all, or one for each actuator, (3, K).
+        """Outputs times a factor: one for all, or one for each actuator, (n, K).
 
         A factor is taken for one of the machine: the state is told of limits as if it had not been
         there, E (v - u)/factor.
         """
-        groups, size = self.direct.shape[:2]
-        each = jnp.reshape(jnp.broadcast_to(factor, (3, groups * size // 3)), (groups, size))
+        ports = self.direct.shape[:2]
+        each = jnp.reshape(factor, ports) if jnp.ndim(factor) else jnp.full(ports, factor)
         tell = self.anti_windup
         if tell is not None:
             is_on = each != 0
@@ -108,7 +91,7 @@ class StateSpace(NamedTuple):
         )
 
     def with_sensors(self, factor: Array) -> StateSpace:
-        """Sensor voltages times a factor each, (3, K)."""
+        """Sensor voltages times a factor each, (n, K)."""
         each = jnp.reshape(factor, (self.direct.shape[0], -1))
         return self._replace(
             enter=self.enter * each[:, None, None], direct=self.direct * each[:, None]

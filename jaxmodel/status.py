@@ -45,8 +45,8 @@ FINISHED = (
 REASONS = {
     OK: "ok",
     OUT_OF_REACH: "pose out of reach",
-    SINGULAR: "singular pose: a link parallel or perpendicular to its guide, or the links' lines "
-    "through one point",
+    SINGULAR: "singular pose: a link along or across the path of its near joint, or the links' "
+    "lines through one point",
     DIVERGED: "diverged: bending beyond a tenth of the link",
     NON_FINITE: "non-finite number",
     SATURATED: "actuators saturated too often",

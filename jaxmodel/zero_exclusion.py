@@ -204,9 +204,10 @@ def _mechanics(setup: Exclusion, nu: Disc, stiffness: Disc, root: Disc, payload:
     """Rows of the pose and of the low modes; columns: pose, low modes, commands."""
     loop, low, tail = setup.loop, setup.low, setup.tail
     links, patches, _ = loop.sensor.shape
-    size = 3 + links * low + links * patches
-    n = len(nu.mid)
-    mid, rad = np.zeros((n, 3 + links * low, size), complex), np.zeros((n, 3 + links * low, size))
+    n, p = len(nu.mid), len(loop.mass)
+    first = p + links * low  # of the commands
+    size = first + links * patches
+    mid, rad = np.zeros((n, first, size), complex), np.zeros((n, first, size))
     nu2 = _lift(_square(nu))
     mass = Disc(
         loop.mass + payload.mid[:, None, None] * loop.payload_mass,
@@ -230,23 +231,23 @@ def _mechanics(setup: Exclusion, nu: Disc, stiffness: Disc, root: Disc, payload:
     weigh = high.inverse * high.x2
     pose = pose + _over_modes("ipr,cir,iqr->cpq", enter, weigh, leave) * nu2.scaled(-1.0)
     forced = _over_modes("ipr,cir,irk->cpik", enter, high.inverse, pull)
-    forced = Disc(*(x.reshape(n, 3, -1) for x in forced)) * nu2.scaled(-1.0)
+    forced = Disc(*(x.reshape(n, p, -1) for x in forced)) * nu2.scaled(-1.0)
     reach = nu2.mid + nu2.rad
-    mid[:, :3, :3], rad[:, :3, :3] = pose.mid, pose.rad + reach**2 * tail.pose_by_pose
-    mid[:, :3, 3 + links * low :] = forced.mid
-    rad[:, :3, 3 + links * low :] = forced.rad + reach * tail.pose_by_voltage
+    mid[:, :p, :p], rad[:, :p, :p] = pose.mid, pose.rad + reach**2 * tail.pose_by_pose
+    mid[:, :p, first:] = forced.mid
+    rad[:, :p, first:] = forced.rad + reach * tail.pose_by_voltage
     own = _resonance(setup, nu, stiffness, 0, low, is_inverted=False)
     for i in range(links):
-        at, link = slice(3 + i * low, 3 + (i + 1) * low), i % own.denominator.mid.shape[1]
+        at, link = slice(p + i * low, p + (i + 1) * low), i % own.denominator.mid.shape[1]
         enters = loop.enter[i, :, :low]
-        mid[:, :3, at], rad[:, :3, at] = -nu2.mid * enters, nu2.rad * np.abs(enters)
+        mid[:, :p, at], rad[:, :p, at] = -nu2.mid * enters, nu2.rad * np.abs(enters)
         each = np.arange(at.start, at.stop)
         mid[:, each, each] = own.denominator.mid[:, link]
         rad[:, each, each] = own.denominator.rad[:, link]
         leaves = loop.leave[i, :, :low].T
-        mid[:, at, :3] = -own.x2.mid[:, link, :, None] * leaves
-        rad[:, at, :3] = own.x2.rad[:, link, :, None] * np.abs(leaves)
-        ports = slice(3 + links * low + i * patches, 3 + links * low + (i + 1) * patches)
+        mid[:, at, :p] = -own.x2.mid[:, link, :, None] * leaves
+        rad[:, at, :p] = own.x2.rad[:, link, :, None] * np.abs(leaves)
+        ports = slice(first + i * patches, first + (i + 1) * patches)
         mid[:, at, ports] = -loop.actuator[i, :low] / loop.omega[i, :low, None] ** 2
     return Disc(mid, rad)
 
@@ -298,7 +299,7 @@ def _chain(loop: ModalLoop, omega: Disc, delay: Disc, image: int) -> Disc:
 def _sensors(
     setup: Exclusion, nu: Disc, stiffness: Disc, root: Disc, omega: Disc, chains: list[Disc]
 ) -> tuple[Disc, Disc, Disc]:
-    """Sampled voltages times E by commands, pose and low modes, (cells, U, U or 3 or 3 J)."""
+    """Sampled voltages times E by commands, pose and low modes, (cells, U, U or p or n J)."""
     loop, tail, low, base = setup.loop, setup.tail, setup.low, setup.base
     links, patches, _ = loop.sensor.shape
     size, n = links * patches, len(nu.mid)
@@ -314,7 +315,7 @@ def _sensors(
     left_out = largest_over(setup.images, omega, float(loop.period))
     direct = Disc(direct.mid + whole.mid, direct.rad + whole.rad + left_out)
     turned = _over_modes("ikr,cir,ipr->cikp", sense, high.inverse * high.x2, leave)
-    by_pose = Disc(*(x.reshape(n, size, 3) for x in turned))
+    by_pose = Disc(*(x.reshape(n, size, len(loop.mass)) for x in turned))
     reach = (nu.mid + nu.rad)[:, None, None] ** 2
     by_pose = Disc(by_pose.mid, by_pose.rad + reach * tail.sensor_by_pose) * first
     seen = np.zeros((size, links * low))
@@ -381,8 +382,9 @@ def _through_pose(
     )
     pushed = _over_modes("ipr,cir,irk->cpik", enter, each.inverse, pull)
     seen = _over_modes("ikr,cir,ipr->cikp", loop.sensor[:, :, :base], moved, leave)
-    pushed = Disc(*(x.reshape(n, 3, -1) for x in pushed))
-    seen = Disc(*(x.reshape(n, -1, 3) for x in seen))
+    p = len(loop.mass)
+    pushed = Disc(*(x.reshape(n, p, -1) for x in pushed))
+    seen = Disc(*(x.reshape(n, -1, p) for x in seen))
     return (seen @ inverse_of(whole) @ pushed).scaled(-1.0)
 
 

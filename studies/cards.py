@@ -65,7 +65,7 @@ def _run(run: Any) -> Card:
     figure = None
     if run.result.record is not None:
         figure, ax = figures.one_panel(2.2)
-        names = [f"link {i + 1}" for i in range(3)]
+        names = [f"link {i + 1}" for i in range(run.study.n_links)]
         bent, time = 1e6 * chord_deflection(run), 1e3 * run.result.record.time
         figures.traces(time, bent, names, "mid-span deflection [µm]", ax)
         ax.axvline(1e3 * float(run.result.command_end), color="#888888", linestyle=":")

@@ -330,9 +330,9 @@ def test_modes_of_a_study_are_those_of_its_own_machine(capsys, tmp_path):
         (("--pose", "nan", 0, 0.5), "= nan; allowed: a finite number"),
         (
             ("--modes", 2, "--pose", 0.5, 0, 0.5),
-            "inside (0, 90) deg (here: pose out of reach; link 1 is 0.2 m long",
+            "guide_offsets moves it) (here: pose out of reach; link 1 is 0.2 m long",
         ),
-        (("--modes", 2, "--pose", 0.09526, 0.055, -1.047), "(here: singular pose: a link parallel"),
+        (("--modes", 2, "--pose", 0.09526, 0.055, -1.047), "(here: singular pose: a link along"),
         (("--poze", 1, 2, 3), "No such option: --poze (Possible options:"),
     ],
 )
@@ -360,7 +360,7 @@ TURN = f"[[{X}, {Y}, 0], [{X}, {Y}, {-2 * math.pi / 3}]]"
             change(WAYPOINTS, f"[[0, 0, {HOME_PHI}], [0.3, 0, {HOME_PHI}]]"),
             "motion.waypoints.1 = [0.3, 0.0, 0.523598775598",
         ),
-        (change(WAYPOINTS, TURN), "(here: singular pose: a link parallel or perpendicular to its"),
+        (change(WAYPOINTS, TURN), "(here: singular pose: a link along or across the path of its"),
         (
             change("duration = 0.05", "duration = 0.025"),
             "run.duration = 0.025; allowed: at least 0.0288, the end of the motion with its shaper",

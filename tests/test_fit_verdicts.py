@@ -278,17 +278,17 @@ def test_the_right_assignment_is_found_by_exchange():
 def test_exchanges_are_permutations_and_mirror_images():
     spec = CASES["payload"].spec(0)
     u = np.array([0.2, 0.5, 0.7])
-    found = np.array(exchanges(spec.free.numbers, [u]))
+    found = np.array(exchanges(spec.free.numbers, [u], 3))
     mirrored = 2 * u.mean() - u
     assert len(found) == 11 and np.abs(found - u).max(axis=1).min() > SAME
     assert {tuple(np.sort(x).round(9)) for x in found} == {
         tuple(np.sort(x).round(9)) for x in (u, mirrored)
     }
-    known = np.array(exchanges(spec.free.numbers, [u, u[[1, 0, 2]]]))  # of one set: no more
+    known = np.array(exchanges(spec.free.numbers, [u, u[[1, 0, 2]]], 3))  # of one set: no more
     assert len(known) == 10
     free = {"link.damping_ratio": {"from": 0.002, "to": 0.04}}
     one = spec_of(HERE, {"kind": "modes", "frequency_hz": [90.0], "sigma_hz": 1.0}, free=free)
-    assert exchanges(one.free.numbers, [np.array([0.3])]) == []
+    assert exchanges(one.free.numbers, [np.array([0.3])], 3) == []
 
 
 def test_frequencies_without_shapes_are_paired_in_their_order():

@@ -300,8 +300,8 @@ def build_plant_of(study):
 
 def test_a_sketch_stands_where_the_machine_does():
     study = random_machine(4)
-    case, pose = build_case(study), np.array(study.motion.waypoints[0])
-    slider, joint = standing(case, pose)
+    pose = np.array(study.motion.waypoints[0])
+    slider, joint = standing(study, pose)
     plant = build_plant_of(study)
     chain = kinematics.close_chain(plant, jnp.array(pose), jnp.zeros(3))
     guide = plant.legs

@@ -50,7 +50,7 @@ MACHINES = {
 PAPER = paper_machine()
 MACHINES["five-bar"] = PAPER._replace(
     geometry=FiveBarGeometry(
-        pivot_distance=0.2,
+        pivot_distance=0.1,
         crank_length=np.array([0.15, 0.16]),
         elbow=np.array([-1.0, 1.0]),
         zero_angle=np.radians([120.0, 60.0]),
@@ -224,7 +224,8 @@ def test_kernel_equals_scan_on_cranks():
     "machine, message",
     [
         ({"kind": "rrrr"}, "machine.kind = 'rrrr'.*prrr"),
-        ({"kind": "five_bar"}, "machine.kind = 'five_bar'; allowed: prrr, rrr"),
+        ({"kind": "rrr", "slider_mass": 0.2}, "slider_mass = 0.2; allowed: not given.*'rrr'"),
+        ({"kind": "five_bar", "platform_inertia": 1e-3}, "platform_inertia.*no such part"),
         ({"kinds": {"rrr": {"crank": 1.0}}}, "machine.kinds.rrr.crank = 1.0.*crank_length"),
         ({"kinds": {"rrr": {"crank_length": 0.0}}}, "crank_length = 0.0; allowed: 0.001 to 10"),
     ],

@@ -83,26 +83,35 @@ REFUSED = [
     ("[motion]\nmove_time = []", "motion.move_time = []; allowed: one number, or 4 of them"),
     ("[motion]\ndwell = [1, 2]", "motion.dwell = [1.0, 2.0]; allowed: one number, or 4 of them"),
     ("[control]\nlinks = [true]", "control.links = [true]; allowed: 3 values true or false"),
-    ("[control]\nratios = [[1]]", "control.ratios = [[1.0]]; allowed: three lists, one per link"),
+    (
+        "[control]\nratios = [[1]]",
+        "control.ratios = [[1]]; allowed: 3 lists, each of finite numbers",
+    ),
     (
         "[control]\nmode_mask = [[true, true, true, true], [], []]",
         "allowed: at most 3 entries per link",
     ),
     (
         "[initial]\nmodal = [[0.001]]",
-        "initial.modal = [[0.001]]; allowed: three lists, one per lin",
+        "initial.modal = [[0.001]]; allowed: an empty list, or 3 lists",
     ),
     ("[shaper]\nfrequencies_hz = [1, 2, 3, 4]", "= [1, 2, 3, 4]; allowed: 0 to 3 finite numbers"),
     ("[electronics]\nlowpass_ratio = []", "lowpass_ratio = []; allowed: 1 or more finite numbers"),
     ("[metrics]\nstations = []", "metrics.stations = []; allowed: 1 to 20 finite numbers [1]"),
     (
         "[patches]\ncenters = []",
-        "patches.centers = []; allowed: one list of centres, or three list",
+        "patches.centers = []; allowed: one list of centres, or one a link",
     ),
-    ("[patches]\ncenters = [[]]", "patches.centers = [[]]; allowed: one list of centres, or three"),
-    ("[patches]\ncenters = [[[0.05]]]", "allowed: a list of finite numbers, or a list of lists"),
-    ("[patches]\ncenters = [0.05, [0.1]]", "allowed: a list of finite numbers, or a list of lists"),
-    ("[patches]\ncenters = [[0.05], [0.05], [0.05, 0.1]]", "or three lists of equal length [m]"),
+    (
+        "[patches]\ncenters = [[]]",
+        "patches.centers = [[]]; allowed: a list of finite numbers, or 3",
+    ),
+    ("[patches]\ncenters = [[[0.05]]]", "allowed: a list of finite numbers, or 3 lists, each of"),
+    (
+        "[patches]\ncenters = [0.05, [0.1]]",
+        "allowed: a list of finite numbers, or 3 lists, each of",
+    ),
+    ("[patches]\ncenters = [[0.05], [0.05], [0.05, 0.1]]", "or one a link of equal length [m]"),
     # fields that do not fit each other
     (
         "[control]\nmodes = 4",
@@ -314,6 +323,6 @@ def test_damping_by_mode_and_link_reaches_the_plant():
     np.testing.assert_allclose(zeta[0, :3], [0.02, 0.01, 0.01 * 9 / 4], rtol=1e-9)
     np.testing.assert_allclose(zeta[1, :3], [0.03, 0.12, 0.27], rtol=1e-9)
     assert study.link.first_damping == 0.02
-    for bad, words in ((((0.01,), (0.02,)), "three lists"), ((), "at least one number")):
+    for bad, words in ((((0.01,), (0.02,)), "3 lists"), ((), "at least one number")):
         with pytest.raises(StudyError, match=f"link.damping_ratio.*{words}"):
             paper_study().change(link__damping_ratio=bad)

@@ -30,8 +30,11 @@ class Mechanism(NamedTuple):
     text: str  # in reports
     n_links: int  # flexible links, each with an actuated joint
     n_pose: int  # coordinates of the platform: 3 of a rigid body, 2 of a point
+    home: tuple[float, ...]  # a pose in the middle of the workspace [m, m, rad], (n_pose,)
     build: Callable[[dict[str, Array], dict[str, Array], Any], tuple[Geometry, Array]]
     parameters: tuple[Parameter, ...] = ()
+    allowed: str = "a pose within reach"  # of the poses, for messages
+    reads: tuple[str, ...] = ()  # fields of `[machine]`, beside those of the platform's inertia
 
 
 def check_mechanism(mechanism: Mechanism) -> None:
@@ -44,6 +47,8 @@ def check_mechanism(mechanism: Mechanism) -> None:
             f"{place}: n_links = {mechanism.n_links}, n_pose = {mechanism.n_pose}; allowed: 3 and "
             "3, or 2 and 2"
         )
+    if len(mechanism.home) != mechanism.n_pose:
+        raise PartError(f"{place}: home = {mechanism.home}; expected {mechanism.n_pose} numbers")
     check_parameters(place, mechanism.parameters)
 
 
@@ -85,6 +90,14 @@ class Legs(Protocol):
             xp: NumPy or `jax.numpy`.
         """
 
+    def misplaced(self, x: np.ndarray, y: np.ndarray, length: np.ndarray) -> list[str]:
+        """What is wrong with far joints that no link reaches, in words; NumPy numbers.
+
+        Args:
+            x, y: of the far joints C [m], (n,) each.
+            length: of the links [m], (n,).
+        """
+
     def carriers(self, near: np.ndarray) -> np.ndarray:
         """Lines of what carries the near joints [m], (n, 2, 2), for a drawing; NumPy numbers.
 
@@ -103,6 +116,10 @@ class Geometry(Protocol):
 
     def size(self) -> float:
         """How large it is [m]; NumPy numbers."""
+
+
+#: Sine and cosine of a link's angle to its path must exceed this: it is singular otherwise [1].
+SINGULAR_MARGIN = 1e-3
 
 
 def polar(radius: Array, angle: Array, xp: Any) -> tuple[Array, Array]:

@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 
 from studies.show.figures import SERIES, SMALL, WIDTH, axes_or_new, styled
 from studies.show.skeleton import Skeleton, skeleton
-from studies.study.consistency import each_link
 from studies.study.spec import Study
 
 #: Largest drawn deflection of a link, as a share of its length [1].
@@ -71,8 +70,8 @@ def mode_skeleton(study: Study, pose: np.ndarray, shape: np.ndarray) -> Skeleton
         pose: at rest [m, m, rad], (3,).
         shape: of the mode over (X, q), (3 + 3R,).
     """
-    length, q = each_link(study.link.length).min(), shape[3:].reshape(3, -1)
-    size = np.abs(shape[:3]) * [1, 1, each_link(study.machine.joint_radius).mean()]
+    length, q = study.each_link(study.link.length).min(), shape[3:].reshape(3, -1)
+    size = np.abs(shape[:3]) * [1, 1, study.each_link(study.machine.joint_radius).mean()]
     factor = min(
         DRAWN * length / max(np.abs(q).max(), 1e-300), DRAWN_POSE * length / max(size.max(), 1e-300)
     )

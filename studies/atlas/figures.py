@@ -24,7 +24,6 @@ from studies.atlas.subsets import (
 )
 from studies.show.figures import SERIES, SMALL, comparison, legend_above, new_figure
 from studies.show.skeleton import skeleton
-from studies.study.consistency import each_link
 
 #: The animation: from before the command's end to after it, and its frames [s].
 CLIP = (-0.02, 0.07, 1e-3)
@@ -315,7 +314,9 @@ def write_animation(findings: AtlasFindings, folder: Path) -> None:
     index = index[index < len(runs.time)]
     q = runs.modal[which, :, index]
     peak = np.abs(runs.modal[which, 0, runs.time >= end, :, 0]).max(initial=1e-9)
-    factor = float(f"{CLIP_SIZE * each_link(findings.study.link.length).min() / peak:.1g}")
+    factor = float(
+        f"{CLIP_SIZE * findings.study.each_link(findings.study.link.length).min() / peak:.1g}"
+    )
     off, on = (
         skeleton(findings.study, runs.pose[which, k, index], q[:, k], factor) for k in (0, -1)
     )

@@ -97,9 +97,9 @@ def natural_modes_at(study: Study, poses: Any) -> PoseModes:
     """
     structure, case = _machine(study)
     poses = np.asarray(poses, float)
-    codes, _, lifts = map(np.asarray, _solve_poses(structure, case, poses))
-    for pose, code, heights in zip(poses, codes, lifts, strict=True):
-        check_pose(study, "pose", tuple(pose.tolist()), int(code), heights)
+    codes = np.asarray(_solve_poses(structure, case, poses)[0])
+    for pose, code in zip(poses, codes, strict=True):
+        check_pose(study, "pose", tuple(pose.tolist()), int(code))
     return _solve(structure, case, poses)
 
 

@@ -20,6 +20,7 @@ from studies.errors import StudyError
 class ModalBlocks(NamedTuple):
     """G groups of N blocks with M sensors and as many actuators; NumPy arrays."""
 
+    n_links: int  # of the machine
     link: np.ndarray  # controlled links, from 0
     first: np.ndarray  # sensor and actuator of each group's first port, from 0, (G,)
     system: StateSpace  # of these groups, blocks of 2 states
@@ -47,7 +48,7 @@ class ModalBlocks(NamedTuple):
         return int(np.ceil(np.log(share) / np.log(max(self.slowest_pole, 0.1)))) + 8
 
     def of_groups(self, volts: np.ndarray) -> np.ndarray:
-        """Voltages of ports by group, (..., G, M), from those of all patches, (..., 3, K)."""
+        """Voltages of ports by group, (..., G, M), from those of all patches, (..., n, K)."""
         size = self.system.direct.shape[1]
         at = self.first[:, None] + np.arange(size)
         return volts.reshape(*volts.shape[:-2], -1)[..., at]
@@ -55,24 +56,25 @@ class ModalBlocks(NamedTuple):
     def of_patches(self, volts: np.ndarray, n_patches: int) -> np.ndarray:
         """The reverse, 0 for patches of no group."""
         size = self.system.direct.shape[1]
-        whole = np.zeros((*volts.shape[:-2], 3 * n_patches), volts.dtype)
+        whole = np.zeros((*volts.shape[:-2], self.n_links * n_patches), volts.dtype)
         whole[..., self.first[:, None] + np.arange(size)] = volts
-        return whole.reshape(*volts.shape[:-2], 3, n_patches)
+        return whole.reshape(*volts.shape[:-2], self.n_links, n_patches)
 
 
-def modal_blocks(system: StateSpace) -> ModalBlocks:
-    """Modal blocks of a system, NumPy arrays; systems of links without output are left out.
+def modal_blocks(system: StateSpace, n_links: int) -> ModalBlocks:
+    """Modal blocks of a machine's system, NumPy arrays; links without output are left out.
 
     Raises:
         StudyError: no well-conditioned modal form.
     """
-    is_on = (np.any(system.leave, axis=(2, 3)) | np.any(system.direct, axis=2)).reshape(3, -1)
+    is_on = np.any(system.leave, axis=(2, 3)) | np.any(system.direct, axis=2)
+    is_on = is_on.reshape(n_links, -1)
     used, n_patches = np.flatnonzero(is_on.any(axis=1)), is_on.shape[1]
     if system.state.shape[0] == 1:
         groups, first = [0], np.array([0])
     else:
         groups, first = list(used), used * n_patches
-    return ModalBlocks(used, first, _stack_groups([_to_pairs(system, g) for g in groups]))
+    return ModalBlocks(n_links, used, first, _stack_groups([_to_pairs(system, g) for g in groups]))
 
 
 def _to_pairs(system: StateSpace, group: int) -> StateSpace:

@@ -212,9 +212,9 @@ class _ChangedLoops:
         loop = SampledLoop(
             open=matrix,
             feedback=np.zeros_like(matrix),
-            mode_poles=np.full((0, 3), np.nan),
+            mode_poles=np.full((0, self._fixed[0].n_links), np.nan),
             omega=omega,
-            is_drive=np.arange(len(matrix)) < 6,
+            is_drive=np.arange(len(matrix)) < 2 * self._fixed[0].n_pose,
             period=float(self._case.electronics.period),
         )
         return name_motion(loop, 1.0, complex(poles[np.argmax(np.abs(poles))]))
@@ -246,16 +246,17 @@ def _pull(
 
 def _shapes(structure: Structure) -> MachineChange:
     """Of the fields of a change."""
-    patches = (3, structure.n_patches)
+    links = (structure.n_links,)
+    patches = (*links, structure.n_patches)
     return MachineChange(
-        stiffness=(3,),
-        damping=(3,),
+        stiffness=links,
+        damping=links,
         payload=(),
         patch=patches,
         delay=(),
         actuator=patches,
         sensor=patches,
-        joint_inertia=(3,),
+        joint_inertia=links,
     )
 
 
@@ -265,8 +266,8 @@ def _limits(
     """Units of all entries, and their smallest and largest values in them."""
     machine = case.machine
     mass = float(machine.masses.platform_mass + np.asarray(machine.masses.payload_mass))
-    towards_b, towards_c = _free_way(case)
-    inertia = np.broadcast_to(machine.beam.joint_inertia_c, (3,))
+    towards_b, towards_c = _free_way(structure, case)
+    inertia = np.broadcast_to(machine.beam.joint_inertia_c, structure.n_links)
     heaviest = np.inf if BASES[structure.basis].has_joints else 0.0
     ends = MachineChange(
         stiffness=(-MOST, MOST),
@@ -294,14 +295,17 @@ def _limits(
     return units, in_units(0), in_units(1)
 
 
-def _free_way(case: Case) -> tuple[np.ndarray, np.ndarray]:
-    """How far each pair of patches can move towards B and towards C [m], (3, K) each.
+def _free_way(structure: Structure, case: Case) -> tuple[np.ndarray, np.ndarray]:
+    """How far each pair of patches can move towards B and towards C [m], (n, K) each.
 
     Half of the gap to a neighbour, so that no two meet, and all of that to an end of the link.
     """
-    patches, length = case.machine.patches, np.broadcast_to(case.machine.beam.length, (3,))
+    patches, length = (
+        case.machine.patches,
+        np.broadcast_to(case.machine.beam.length, structure.n_links),
+    )
     longer = np.maximum(patches.sensor_length, patches.actuator_length)
-    half = np.broadcast_to(longer / 2, (3,))[:, None]
+    half = np.broadcast_to(longer / 2, structure.n_links)[:, None]
     center = np.asarray(patches.center)
     order = np.argsort(center, axis=1)
     rising = np.take_along_axis(center, order, axis=1)

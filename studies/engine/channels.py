@@ -146,8 +146,8 @@ def unfold(channels: ActiveChannels, like: Controller) -> Controller:
         estimator=estimator._replace(
             first=columns(channels.first, estimator.first),
             denominator=columns(channels.denominator, estimator.denominator),
-            velocity=columns(-channels.force, (none,) * 3),
-            position=(none,) * 3,
+            velocity=columns(-channels.force, (none,) * len(estimator.position)),
+            position=(none,) * len(estimator.position),
             direct=spread(-channels.direct, none),
         ),
     )

@@ -137,7 +137,7 @@ def case_variables(table: CaseTable) -> dict[str, Variable]:
         "repeat": Variable(table.repeat, axis, "1", "number of the repeat"),
     }
     for name, column in table.columns.items():
-        array = as_numbers(column)
+        array = as_numbers(column, table.study.n_links)
         entry = parse_entry(name)
         field = entry.field if entry else name
         dims = _LIST_AXES.get(field, ())[-(array.ndim - 1) :] if array.ndim > 1 else ()

@@ -29,7 +29,11 @@ class FixedController(NamedTuple):
     controller: Controller
     channels: ActiveChannels | ModalBlocks  # the same as code needs it
     taps: Taps  # shaper on the sample grid, one tap per delay, delays rising
-    frequency: np.ndarray  # each channel's velocity estimate is exact there [Hz], (3, C)
+    frequency: np.ndarray  # each channel's velocity estimate is exact there [Hz], (n, C)
+
+    @property
+    def n_links(self) -> int:
+        return len(self.controller.feedthrough)
 
     @property
     def n_patches(self) -> int:
@@ -108,12 +112,12 @@ def arrange(controller: Controller, law: str) -> ActiveChannels | ModalBlocks:
         StudyError: a system without a well-conditioned modal form.
     """
     if isinstance(controller.feedback, StateSpace):
-        return modal_blocks(controller.feedback)
+        return modal_blocks(controller.feedback, len(controller.feedthrough))
     return fold(controller.feedback, LAWS[law].channel)
 
 
 def _frequencies(structure: Structure, believed_omega: np.ndarray) -> np.ndarray:
-    """Where the velocity estimate of each channel is exact [Hz], (3, C)."""
+    """Where the velocity estimate of each channel is exact [Hz], (n, C)."""
     hertz = believed_omega / (2 * np.pi)
     return hertz if is_modal(structure) else np.repeat(hertz[:, :1], n_channels(structure), axis=1)
 

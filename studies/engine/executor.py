@@ -158,7 +158,7 @@ class Executor:
         """The same program for both passes, which differ in ratios and links."""
         if not self.has_own_ratio:
             return cases
-        shape = (self.layout.size, 3, self.structure.n_controlled)
+        shape = (self.layout.size, self.structure.n_links, self.structure.n_controlled)
         cases = with_ratio(cases, np.broadcast_to(cases.control.ratio, shape))
         links = np.broadcast_to(cases.control.link_mask, shape[:2])
         return cases._replace(control=cases.control._replace(link_mask=links))

@@ -47,7 +47,7 @@ class LoopGains(NamedTuple):
 
     plant: PlantResponse  # leaves (n, ...)
     controller: Any  # Controller; a linear system's feedback is a `ModalSystem` if it can be
-    pairs: np.ndarray  # products of a mode's rows and columns, see `_modal_sums`, (n, 3, R, p)
+    pairs: np.ndarray  # products of a mode's rows and columns, see `_modal_sums`, (n, l, R, q)
     acting: np.ndarray  # numbers of the commands, (m,)
 
     @property
@@ -107,51 +107,52 @@ class LoopGains(NamedTuple):
         return -feedback[..., self.acting, :] @ sensed
 
     def _sensed(self, w: np.ndarray, gain: np.ndarray, images: int) -> np.ndarray:
-        """Sensor volts per command, see `plant_images`; images summed, (n, F, 3 K, m)."""
-        plant, k, n = self.plant, self.plant.sensor.shape[2], len(w)
+        """Sensor volts per command, see `plant_images`; images summed, (n, F, l K, m)."""
+        plant, n = self.plant, len(w)
+        (links, k), p = plant.sensor.shape[1:3], plant.mass.shape[-1]
         square = w * w
-        blocks = self._modal_sums(w)  # (n, 3, N, K + 3, K + 3)
+        blocks = self._modal_sums(w)  # (n, l, N, K + p, K + p)
         at = (..., None, None)
         dynamic = (1j * w)[at] * plant.damping[:, None] + (
             plant.stiffness[:, None] - square[at] * plant.mass[:, None]
         )
         dynamic = dynamic - (square * square)[at] * blocks[..., k:, k:].sum(axis=1)
-        compliance = (gain * square * square)[at] * inverse_3(dynamic)
-        leaving = blocks[..., :k, k:].transpose(0, 2, 1, 3, 4).reshape(n, -1, 3 * k, 3)
-        entering = blocks[..., k:, :k].transpose(0, 2, 3, 1, 4).reshape(n, -1, 3, 3 * k)
-        leaving = (leaving @ compliance).reshape(n, -1, images, 3 * k, 3)
+        compliance = (gain * square * square)[at] * small_inverse(dynamic)
+        leaving = blocks[..., :k, k:].transpose(0, 2, 1, 3, 4).reshape(n, -1, links * k, p)
+        entering = blocks[..., k:, :k].transpose(0, 2, 3, 1, 4).reshape(n, -1, p, links * k)
+        leaving = (leaving @ compliance).reshape(n, -1, images, links * k, p)
         # the sum over images and pose is one product
-        left = leaving.transpose(0, 1, 3, 2, 4).reshape(n, -1, 3 * k, 3 * images)
-        sensed = left @ entering[..., self.acting].reshape(n, -1, 3 * images, len(self.acting))
+        left = leaving.transpose(0, 1, 3, 2, 4).reshape(n, -1, links * k, p * images)
+        sensed = left @ entering[..., self.acting].reshape(n, -1, p * images, len(self.acting))
         own = gain[:, None, :, None, None] * (blocks[..., :k, :k] + plant.direct[:, :, None])
-        own = own.reshape(n, 3, -1, images, k, k).sum(axis=3)
-        whole = np.zeros((*sensed.shape[:3], 3 * k), complex)
-        for i in range(3):
+        own = own.reshape(n, links, -1, images, k, k).sum(axis=3)
+        whole = np.zeros((*sensed.shape[:3], links * k), complex)
+        for i in range(links):
             rows = slice(i * k, (i + 1) * k)
             whole[..., rows, rows] = own[:, i]
         return sensed + whole[..., self.acting]
 
     def _modal_sums(self, w: np.ndarray) -> np.ndarray:
-        """Sums over the modes of each link at j w, (n, 3, N, K + 3, K + 3).
+        """Sums over the modes of each link at j w, (n, l, N, K + p, K + p).
 
         Rows are sensors and forces on the pose, columns actuators and motions of the pose. Real and
         imaginary parts are multiplied by real matrices, which takes half the time.
         """
         plant, count = self.plant, w.shape[1]
         w = w[:, None, :, None]
-        stiff = plant.square[:, :, None] - w * w  # (n, 3, N, R)
+        stiff = plant.square[:, :, None] - w * w  # (n, l, N, R)
         loss = plant.decay[:, :, None] * w
         size = 1 / (stiff * stiff + loss * loss)
         both = np.concatenate([stiff * size, -loss * size], axis=2) @ self.pairs
         whole = both[:, :, :count] + 1j * both[:, :, count:]
-        side = plant.sensor.shape[2] + 3
+        side = plant.sensor.shape[2] + plant.mass.shape[-1]
         return whole.reshape(*whole.shape[:3], side, side)
 
 
 def loop_gains(response: SampledLoopResponse) -> LoopGains:
     """Loop gains by frequency responses, leaves (n, ...), NumPy in float64."""
     plant = response.plant
-    rows = np.concatenate([plant.sensor, plant.enter], axis=2)  # (n, 3, K + 3, R)
+    rows = np.concatenate([plant.sensor, plant.enter], axis=2)  # (n, l, K + p, R)
     columns = np.concatenate([np.swapaxes(plant.actuator, 2, 3), plant.leave], axis=2)
     pairs = np.einsum("niar,nibr->nirab", rows, columns)
     acting = np.flatnonzero(acting_commands(response.controller).any(axis=0))
@@ -162,7 +163,7 @@ def loop_gains(response: SampledLoopResponse) -> LoopGains:
 
 
 def acting_commands(controller: Controller) -> np.ndarray:
-    """Which commands act, (n, 3 K)."""
+    """Which commands act, (n, l K)."""
     n = len(controller.voltage_limit)
     seen = _feedback(controller, np.broadcast_to(np.exp(1j * np.array([0.3, 3.0])), (n, 2)))
     return np.any(seen != 0, axis=(1, 3))
@@ -196,7 +197,7 @@ def _electronics(plant: PlantResponse, omega: np.ndarray, w: np.ndarray) -> np.n
 
 
 def _feedback(controller: Any, z: np.ndarray) -> np.ndarray:
-    """See `jaxmodel.frequency_response.controller_response`, (n, F, 3 K, 3 K)."""
+    """See `jaxmodel.frequency_response.controller_response`, (n, F, l K, l K)."""
     feedback, through, notch = controller.feedback, controller.feedthrough, controller.notch
     if isinstance(feedback, Channels):
         estimator = jax.tree.map(lambda x: x[:, None], feedback.estimator)
@@ -211,11 +212,11 @@ def _feedback(controller: Any, z: np.ndarray) -> np.ndarray:
     groups, m = blocks.shape[2:4]
     if notch is not None:
         coefficients = jax.tree.map(lambda x: x[:, None], notch)
-        passed = np.asarray(notch_response(coefficients, z[..., None]))  # (n, F, 3)
+        passed = np.asarray(notch_response(coefficients, z[..., None]))  # (n, F, l)
         columns = np.repeat(passed, through.shape[2], axis=2)
         blocks = blocks * columns.reshape(*z.shape, groups, 1, m)
     if np.any(through):
-        own = through if groups == 3 else block_diagonal(through)[:, None]
+        own = through if groups == through.shape[1] else block_diagonal(through)[:, None]
         late = own[:, None] / z[..., None, None, None]
         blocks = np.linalg.solve(np.eye(m) + blocks @ late, blocks)
     return block_diagonal(blocks)
@@ -252,8 +253,12 @@ def _modal_form(system: StateSpace) -> StateSpace | ModalSystem:
     )
 
 
-def inverse_3(matrix: np.ndarray) -> np.ndarray:
-    """Of matrices (..., 3, 3), by cofactors."""
+def small_inverse(matrix: np.ndarray) -> np.ndarray:
+    """Of matrices (..., p, p), p = 2 or 3, by cofactors."""
+    if matrix.shape[-1] == 2:
+        (a, b), (c, d) = np.moveaxis(matrix, (-2, -1), (0, 1))
+        turned = np.stack([np.stack([d, -b], axis=-1), np.stack([-c, a], axis=-1)], axis=-2)
+        return turned / (a * d - b * c)[..., None, None]
     a, b, c = (matrix[..., k, :] for k in range(3))
 
     def crossed(x: np.ndarray, y: np.ndarray) -> np.ndarray:

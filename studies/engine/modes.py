@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.kinematics import lift, path_status
+from jaxmodel.kinematics import path_status
 from jaxmodel.linear import linearise, mass_and_stiffness, natural_modes, resting
 from jaxmodel.prepare import prepare
 from studies.engine.preflight import check_pose
@@ -139,12 +139,13 @@ def machine_modes(study: Study | None = None, **changes: Any) -> NamedModes:
     warn_of_patches(study)
     structure, case = build_structure(study), as_arrays(build_case(study))
     where = study.motion.waypoints[0]
-    code, lifts, plant, mass, stiffness, modal_stiffness = jax.tree.map(
+    code, plant, mass, stiffness, modal_stiffness = jax.tree.map(
         np.asarray, _at_pose(structure, case, np.array(where))
     )
-    check_pose(study, "pose", where, int(code), lifts)
+    check_pose(study, "pose", where, int(code))
     modes = natural_modes(plant)
-    first = 3 if study.drive.locked else 0  # the coordinates held by the sliders are not modes
+    # the coordinates that the drives hold are not modes
+    first = structure.n_pose if study.drive.locked else 0
     frequency, shape = modes.frequency[first:], modes.shape[:, first:]
     link_share = _link_shares(frequency, shape, stiffness, modal_stiffness)
     return NamedModes(
@@ -153,14 +154,14 @@ def machine_modes(study: Study | None = None, **changes: Any) -> NamedModes:
         shape=shape,
         link_share=link_share,
         drive_share=1 - link_share.sum(axis=(1, 2)),
-        turn_share=_turn_shares(shape, mass),
+        turn_share=_turn_shares(shape, mass, structure.n_pose),
     )
 
 
 def _link_shares(
     frequency: np.ndarray, shape: np.ndarray, stiffness: np.ndarray, modal_stiffness: np.ndarray
 ) -> np.ndarray:
-    """`link_share` of `NamedModes`; stiffness in (X, q), k_ij of the links (3, R)."""
+    """`link_share` of `NamedModes`; stiffness in (X, q), k_ij of the links (n, R)."""
     share = np.full((len(frequency), *modal_stiffness.shape), np.nan)
     group = np.cumsum(np.diff(frequency, prepend=frequency[0]) > EQUAL * frequency)
     for members in (group == k for k in np.unique(group)):
@@ -168,23 +169,25 @@ def _link_shares(
             continue
         mode = shape[:, members]
         energy = mode.conj().T @ stiffness @ mode
-        square = np.diag(mode @ np.linalg.solve(energy, mode.conj().T)).real[3:] / members.sum()
+        square = np.diag(mode @ np.linalg.solve(energy, mode.conj().T)).real / members.sum()
+        square = square[-modal_stiffness.size :]
         share[members] = modal_stiffness * square.reshape(modal_stiffness.shape)
     return share
 
 
-def _turn_shares(shape: np.ndarray, mass: np.ndarray) -> np.ndarray:
+def _turn_shares(shape: np.ndarray, mass: np.ndarray, n_pose: int) -> np.ndarray:
     """`turn_share` of `NamedModes`; mass in (X, q)."""
-    part = np.einsum("am,ab,bm->abm", shape[:3].conj(), mass[:3, :3], shape[:3]).real
-    turning, translating = part[2, 2], part[:2, :2].sum(axis=(0, 1))
+    pose = shape[:n_pose]
+    part = np.einsum("am,ab,bm->abm", pose.conj(), mass[:n_pose, :n_pose], pose).real
+    turning, translating = part[2:, 2:].sum(axis=(0, 1)), part[:2, :2].sum(axis=(0, 1))
     return turning / np.maximum(turning + translating, np.finfo(float).tiny)
 
 
 @kept_jit(static_argnums=0)
 def _at_pose(structure: Structure, case: Case, pose: np.ndarray) -> Any:
-    """Status, `lift`, linear plant, its mass and stiffness matrices, and k_ij of the links."""
+    """Status, linear plant, its mass and stiffness matrices, and k_ij of the links."""
     loop = prepare(structure, case).loop
     code, _ = path_status(loop.plant, pose[None])
     plant = linearise(structure, loop, pose, resting(structure, case))
     matrices = mass_and_stiffness(loop, pose, plant)
-    return code, lift(loop.plant, pose), plant, *matrices, loop.plant.stiffness
+    return code, plant, *matrices, loop.plant.stiffness

@@ -274,7 +274,7 @@ def local_layout(n: int, structure: Structure) -> Layout:
     devices = len(jax.local_devices())
     # a case's command takes most memory: references at every point of every step
     points = structure.n_steps * (2 * structure.plant_steps + 1)
-    lane_bytes = points * 3 * 8 * 8 + 2**16
+    lane_bytes = points * structure.n_pose * 8 * 8 + 2**16
     lanes, unit = most_lanes(), lane_unit()
     while lanes > unit and devices * lanes * lane_bytes > memory_budget():
         lanes //= 2

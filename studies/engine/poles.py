@@ -20,15 +20,15 @@ HEADER = ["mode", "link", "specified", "nominal link", "assembled machine"]
 
 
 class PoleReport(NamedTuple):
-    """Poles s = -alpha + j beta of controlled modes [1/s], complex, (3, C); NaN: not controlled."""
+    """Poles s = -alpha + j beta of controlled modes [1/s], complex, (n, C); NaN: not controlled."""
 
     specified: np.ndarray
     nominal: np.ndarray  # of the nominal link's loop
-    assembled: np.ndarray  # of the three assembled modes of each order, nearest to the nominal ones
+    assembled: np.ndarray  # of the assembled modes of each order, nearest to the nominal ones
     gain_factor: float  # control.gain_factor [1]
     is_by_damping: bool  # specified as added damping ratios, and shown as such
-    plant_omega: np.ndarray  # of the links between held ends [rad/s], (3, C)
-    model_omega: np.ndarray  # of the controller's model [rad/s], (3, C)
+    plant_omega: np.ndarray  # of the links between held ends [rad/s], (n, C)
+    model_omega: np.ndarray  # of the controller's model [rad/s], (n, C)
 
 
 def tracked_modes(structure: Structure) -> int:
@@ -39,7 +39,7 @@ def tracked_modes(structure: Structure) -> int:
 
 @kept_jit(static_argnums=0)
 def _nominal_loop(structure: Structure, case: Case) -> Any:
-    """`nominal_loop`; frequencies of plant and controller's model [rad/s], (3, C) each."""
+    """`nominal_loop`; frequencies of plant and controller's model [rad/s], (n, C) each."""
     bases = find_bases(structure, case)
     return *nominal_loop(structure, case), bases.plant_omega, bases.believed_omega
 
@@ -75,9 +75,9 @@ def pole_report(structure: Structure, case: Case, loop: LoopFigures) -> PoleRepo
 
 
 def _matched(nominal: np.ndarray, poles: np.ndarray) -> np.ndarray:
-    """The three assembled poles in the order that brings them nearest to the nominal link's."""
+    """The assembled poles in the order that brings them nearest to the nominal link's."""
     return min(
-        (poles[list(order)] for order in permutations(range(3))),
+        (poles[list(order)] for order in permutations(range(len(poles)))),
         key=lambda ordered: float(np.nansum(np.abs(ordered - nominal))),
     )
 

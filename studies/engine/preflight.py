@@ -14,7 +14,7 @@ from jaxmodel.axial import critical_force, lumping_error
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
 from jaxmodel.drives import DRIVES
-from jaxmodel.kinematics import SINGULAR_MARGIN, lift, path_status
+from jaxmodel.kinematics import path_status
 from jaxmodel.laws import is_modal, n_channels
 from jaxmodel.linear import linearise, mechanical, resting
 from jaxmodel.motion import end_of_path, sample_path
@@ -35,7 +35,8 @@ from studies.engine.programs import kept_jit
 from studies.engine.simplifications import warn_of_lumping, warn_of_mismatch, warn_of_patches
 from studies.errors import field_error
 from studies.study.cases import as_arrays, build_case, build_structure
-from studies.study.consistency import check_locked, each_link
+from studies.study.consistency import check_locked
+from studies.study.geometry import far_joints, machine_geometry
 from studies.study.spec import AUTO, Study
 from studies.study.window import never_settles, residual_delay
 
@@ -46,11 +47,10 @@ SUBSTEP_LIMIT = 200
 class Preflight(NamedTuple):
     """What is known about a case before it runs."""
 
-    pose_status: Any  # of every way-point, (n,)
-    lift: Any  # of the links there, see `jaxmodel.kinematics.lift` [1], (n, 3)
+    pose_status: Any  # of every way-point, (m,)
     path_status: Any  # first fault along the unshaped path, ()
     path_time: Any  # when [s], ()
-    path_pose: Any  # where, (3,)
+    path_pose: Any  # where, (p,)
     motion_end: Any  # of the unshaped motion [s], ()
     shaper_length: Any  # [s], ()
     condition: Any  # worst condition number of filter and synthesizer [1], ()
@@ -79,7 +79,7 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
     plant = prepared.loop.plant
     shaper_length = last_sample(prepared.taps) * case.electronics.period
     points = jnp.asarray(case.path.waypoints)
-    each = jax.vmap(lambda pose: (path_status(plant, pose[None])[0], lift(plant, pose)))(points)
+    reached = jax.vmap(lambda pose: path_status(plant, pose[None])[0])(points)
     end = end_of_path(case.path)
     time = jnp.linspace(0.0, 1.0, 2001) * end
     reference = sample_path(case.path, time)
@@ -92,31 +92,32 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
     corner = lowpass_corner(structure, case, prepared.bases)
     damping = jnp.max(damping_ratio(case.machine.damping, prepared.loop.omega))
     return Preflight(
-        *each,
-        code,
-        time[index],
-        reference.position[index],
-        end,
-        shaper_length,
-        worst,
-        drive_rate(structure.drive, case),
-        coupled_rate(structure, case),
-        jnp.max(prepared.loop.omega),
-        damping,
-        corner,
-        steady_load(structure, case, plant),
-        critical_force(plant),
-        lumping,
-        prepared.bases.plant_omega,
-        prepared.bases.believed_omega,
-        prepared.loop.controller,
-        prepared.taps,
+        pose_status=reached,
+        path_status=code,
+        path_time=time[index],
+        path_pose=reference.position[index],
+        motion_end=end,
+        shaper_length=shaper_length,
+        condition=worst,
+        drive_rate=drive_rate(structure.drive, case),
+        coupled_rate=coupled_rate(structure, case),
+        highest=jnp.max(prepared.loop.omega),
+        damping=damping,
+        corner=corner,
+        steady_load=steady_load(structure, case, plant),
+        critical_force=critical_force(plant),
+        lumping=lumping,
+        plant_omega=prepared.bases.plant_omega,
+        believed_omega=prepared.bases.believed_omega,
+        controller=prepared.loop.controller,
+        taps=prepared.taps,
     )
 
 
 def _without_run(structure: Structure) -> Structure:
     """Only machine and controller, so that runs of any kind share a compilation."""
     kept = (
+        "mechanism",
         "n_modes",
         "n_controlled",
         "n_patches",
@@ -155,15 +156,13 @@ def check_run(study: Study) -> tuple[Structure, Case]:
         substeps = max(substeps, int(step_counts(rate / COUPLED_STEP_LIMIT)))
     structure = structure._replace(substeps=substeps)
     for k, pose in enumerate(study.motion.waypoints):
-        check_pose(
-            study, f"motion.waypoints.{k}", pose, int(prepared.pose_status[k]), prepared.lift[k]
-        )
+        check_pose(study, f"motion.waypoints.{k}", pose, int(prepared.pose_status[k]))
     if int(prepared.path_status) != status.OK:
-        x, y, phi = prepared.path_pose
+        place = ", ".join(f"{x:.4g}" for x in prepared.path_pose)
         raise field_error(
             "motion.waypoints",
-            f"path at t = {prepared.path_time:.4g} s, pose ({x:.4g}, {y:.4g}, {phi:.4g})",
-            "a path on which every link angle gamma stays inside (0, 90) deg "
+            f"path at t = {prepared.path_time:.4g} s, pose ({place})",
+            f"{study.mechanism.allowed}, all along the path "
             f"(here: {status.REASONS[int(prepared.path_status)]})",
             "m, m, rad",
         )
@@ -188,45 +187,28 @@ def check_run(study: Study) -> tuple[Structure, Case]:
     return structure, case
 
 
-def check_pose(
-    study: Study, field: str, pose: tuple[float, float, float], code: int, lifts: np.ndarray
-) -> None:
-    """Reject a pose out of reach, or with a link parallel or square to its guide.
+def check_pose(study: Study, field: str, pose: tuple[float, ...], code: int) -> None:
+    """Reject a pose out of reach, or a singular one.
 
     Args:
         study: supplies the machine.
         field: name for the message.
-        pose: (x, y, phi) [m, m, rad].
+        pose: (x, y, phi), or (x, y) of a point [m, m, rad].
         code: its status.
-        lifts: of the links there, (3,).
 
     Raises:
         StudyError: out of reach or singular.
     """
     if code == status.OK:
         return
-    lengths = each_link(study.link.length)
-    wrong = [
-        f"link {i + 1} is {length:.4g} m long, its joint lies {x * length:.4g} m inside its guide"
-        for i, (x, length) in enumerate(zip(lifts, lengths, strict=True))
-        if not SINGULAR_MARGIN <= x < np.sqrt(1 - SINGULAR_MARGIN**2)
-    ]
+    geometry, _ = machine_geometry(study)
+    far, _ = far_joints(geometry, pose, study.n_links)
+    wrong = geometry.legs(np).misplaced(*far.T, study.each_link(study.link.length))
+    allowed = study.mechanism.allowed
     if not wrong:
-        raise field_error(
-            field,
-            pose,
-            "a pose where the lines of the links do not meet in one point "
-            f"(here: {status.REASONS[code]})",
-            "m, m, rad",
-        )
-    raise field_error(
-        field,
-        pose,
-        "a pose where the joint of each link lies inside its guide by more than 0 and less than "
-        f"link.length, so that gamma is inside (0, 90) deg (here: {status.REASONS[code]}; "
-        f"{wrong[0]}; machine.guide_offsets moves it)",
-        "m, m, rad",
-    )
+        allowed = "a pose where the lines of the links do not meet in one point"
+    reason = "; ".join([status.REASONS[code], *wrong[:1]])
+    raise field_error(field, pose, f"{allowed} (here: {reason})", "m, m, rad")
 
 
 def _check_load(study: Study, prepared: Preflight) -> None:

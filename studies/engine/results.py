@@ -155,12 +155,17 @@ def read_baseline(folder: Path, spec: SweepSpec) -> dict[str, Variable]:
         variables, attributes = read_store(path)
     except StudyError:
         raise StudyError(f"{path}: damaged; remove it and go on with --resume") from None
+    n_links = spec.study.n_links
     for name, stored in variables.items():
         dims = BASELINE_DIMS.get(name, METRICS[name].dims if name in METRICS else None)
         if dims is None:
             continue
         sizes = dict(zip(stored.dims, stored.data.shape, strict=False))
-        if stored.dims != dims or sizes.get("link", 3) != 3 or stored.data.dtype.kind not in "if":
+        if (
+            stored.dims != dims
+            or sizes.get("link", n_links) != n_links
+            or stored.data.dtype.kind not in "if"
+        ):
             raise StudyError(f"{path}: damaged ({name}); remove it and go on with --resume")
     return variables if attributes.get("case_id") == baseline_id(spec) else {}
 
@@ -299,7 +304,7 @@ def _worst(
     if "pose_axis" in dims:  # the angle has another unit
         array = np.take(array, (0, 1), axis=dims.index("pose_axis"))
     if array.dtype.kind == "f" and "link" in dims:
-        shape = [3 if d == "link" else 1 for d in dims]
+        shape = [-1 if d == "link" else 1 for d in dims]
         array = np.where(np.reshape(counted_links(data), shape), array, np.nan)
     flat = array.reshape(len(array), -1)
     if flat.dtype.kind != "f":
@@ -311,12 +316,12 @@ def _worst(
 
 
 def counted_links(data: SweepData) -> np.ndarray:
-    """Links that a metric counts: those that any case controls, all if none does, (3,).
+    """Links that a metric counts: those that any case controls, all if none does, (n,).
 
     The same for all cases; otherwise fewer controlled links would look like less vibration.
     """
     is_counted = np.any(controlled(data.table), axis=0)
-    return is_counted if is_counted.any() else np.ones(3, bool)
+    return is_counted if is_counted.any() else np.ones_like(is_counted)
 
 
 def controlled(table: CaseTable) -> np.ndarray:

@@ -24,7 +24,6 @@ from studies.engine.poles import PoleReport
 from studies.engine.programs import kept_jit
 from studies.engine.runs import Run
 from studies.store import Variable, axis_sizes
-from studies.study.consistency import each_link
 from studies.study.labels import STATUS_LABEL
 from studies.study.margin import MARGIN_MODES
 from studies.study.spec import Study
@@ -167,7 +166,7 @@ def chord_deflection(run: Run) -> np.ndarray:
 
     From the plant's modes and, for those it leaves out, the voltages on the actuators.
     """
-    middle = each_link(run.study.link.length)[:, None] / 2
+    middle = run.study.each_link(run.study.link.length)[:, None] / 2
     per_mode, per_volt = map(np.asarray, _deflections_at(run.structure, run.case, middle))
     record = run.result.record
     assert record is not None

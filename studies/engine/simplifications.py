@@ -8,7 +8,6 @@ import numpy as np
 
 from jaxmodel.beam import BASES
 from studies.errors import warn_of_model
-from studies.study.consistency import each_link
 from studies.study.held_link import first_frequency
 
 if TYPE_CHECKING:
@@ -61,7 +60,7 @@ def warn_of_mismatch(study: Study, plant_omega: np.ndarray, model_omega: np.ndar
     """
     if study.control.feedback == "none":
         return
-    nominal = plant_omega / np.sqrt(each_link(study.link.stiffness_factor))[:, None]
+    nominal = plant_omega / np.sqrt(study.each_link(study.link.stiffness_factor))[:, None]
     error = np.abs(model_omega / nominal - 1) * np.array(study.control.links)[:, None]
     if error.size == 0 or error.max() <= MISMATCH_LIMIT:
         return

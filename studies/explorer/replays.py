@@ -12,7 +12,6 @@ from studies.engine.run_data import chord_deflection
 from studies.engine.runs import Run, run_study, uncontrolled_twin
 from studies.errors import StudyError
 from studies.show.skeleton import skeleton
-from studies.study.consistency import each_link
 from studies.study.spec import Study
 
 #: Cases rerun for a page at most.
@@ -79,7 +78,7 @@ def _in_pictures(row: int, run: Run, twin: Run | None) -> ReplayedCase:
     runs = [run] if twin is None else [run, twin]
     bent = [chord_deflection(x) for x in runs]
     peak = max(float(np.nanmax(np.abs(x), initial=0)) for x in bent)
-    factor = exaggeration(peak, each_link(run.study.link.length).min())
+    factor = exaggeration(peak, run.study.each_link(run.study.link.length).min())
     points = _spread(0, len(time), N_POINTS)
     last = min(end + AFTER, time[-1])
     frames = _spread(0, int(np.searchsorted(time, last)), N_FRAMES)

@@ -218,7 +218,9 @@ def compare_drive(code: DriveCode, compiler: list[str]) -> tuple[float, float]:
         in double precision; in single precision.
     """
     rng = np.random.default_rng(0)
-    walk = np.cumsum(rng.normal(size=(3, SAMPLES, 3)), axis=1) / np.sqrt(SAMPLES)
+    walk = np.cumsum(rng.normal(size=(3, SAMPLES, code.structure.n_links)), axis=1) / np.sqrt(
+        SAMPLES
+    )
     size = np.array([1e-3, 0.2, 0.7 * float(code.drive.force_limit.min())])
     e, rate, forward = walk * np.array(size)[:, None, None]
     wanted = np.asarray(_respond(code.structure, code.drive, code.period, e, rate, forward))
@@ -233,8 +235,8 @@ def compare_drive(code: DriveCode, compiler: list[str]) -> tuple[float, float]:
 def _respond(
     structure: Structure, drive: Drive, period: float, e: Any, rate: Any, forward: Any
 ) -> Any:
-    """Feedback of the drive after each sample of errors and feed-forward, (n, 3)."""
-    still = jnp.zeros((3,), e.dtype)
+    """Feedback of the drive after each sample of errors and feed-forward, (T, n)."""
+    still = jnp.zeros(structure.n_links, e.dtype)
 
     def one(state: Any, inputs: Any) -> Any:
         e, rate, forward = inputs
@@ -248,11 +250,11 @@ def _respond(
 
 
 def _run(code: DriveCode, compiler: list[str], kind: type, *signals: np.ndarray) -> np.ndarray:
-    """Feedback of the compiled drive after each sample, (n, 3)."""
+    """Feedback of the compiled drive after each sample, (T, n)."""
     inputs: list[np.ndarray] = [np.ascontiguousarray(x, kind) for x in signals]
     found = np.empty_like(inputs[0])
     with library(code.source, code.name, compiler, kind) as loaded:
-        state = ctypes.create_string_buffer(6 * 8)
+        state = ctypes.create_string_buffer(2 * code.structure.n_links * 8)
         getattr(loaded, f"{code.name}_init")(state)
         step = getattr(loaded, f"{code.name}_step")
         for k in range(len(found)):

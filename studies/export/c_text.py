@@ -51,10 +51,14 @@ def source(
         **_channel_values(channels),
         "electronics": electronics,
         "shaper": exported.study.shaper.kind,
+        "n_links": exported.n_links,
+        "n_pose": exported.structure.n_pose,
         "n_patches": exported.n_patches,
-        "is_used": np.isin(np.arange(3), channels.link).astype(int),
+        "is_used": np.isin(np.arange(exported.n_links), channels.link).astype(int),
         "patches": [
-            f"link {i}, patch {k + 1}" for i in (1, 2, 3) for k in range(exported.n_patches)
+            f"link {i + 1}, patch {k + 1}"
+            for i in range(exported.n_links)
+            for k in range(exported.n_patches)
         ],
         "has_feedthrough": has_feedthrough,
         "has_first": has_feedthrough or isinstance(channels, ActiveChannels),

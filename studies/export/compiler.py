@@ -69,8 +69,8 @@ class Code(NamedTuple):
         return values, np.array(faults)
 
     def shape(self, reference: np.ndarray) -> np.ndarray:
-        """A shaped reference (T, 3), starting at rest in its first row."""
-        room = ctypes.create_string_buffer(self.shaper_length * 3 * 8 + 64)
+        """A shaped reference (T, p), starting at rest in its first row."""
+        room = ctypes.create_string_buffer(self.shaper_length * reference.shape[1] * 8 + 64)
         poses: np.ndarray = np.ascontiguousarray(reference, self.reference)
         getattr(self.library, f"{self.name}_shape_init")(room, _address(poses[0]))
         out = np.empty_like(poses)

@@ -44,13 +44,14 @@ def cost_of(exported: FixedController, fixed: FixedPoint | FixedBlocks) -> Cost:
     n_channels = k * len(np.unique(exported.channels.link))
     count = _of_blocks if isinstance(fixed, FixedBlocks) else _of_channels
     roundings, words = count(fixed)  # type: ignore[arg-type]
-    # codes to counts; three coordinates of the shaper
-    products = products_of(exported.channels) + n_channels + 3 * n_taps
-    roundings += 2 * n_channels + 3
-    words += 3 * k + 1 + 2 * (3 * (int(exported.taps.sample.max()) + 1) + 1)
+    links, pose = exported.n_links, exported.structure.n_pose
+    # codes to counts; the coordinates of the shaper
+    products = products_of(exported.channels) + n_channels + pose * n_taps
+    roundings += 2 * n_channels + pose
+    words += links * k + 1 + 2 * (pose * (int(exported.taps.sample.max()) + 1) + 1)
     if fixed.wires.feedthrough is not None:
         products, roundings = products + n_channels * k, roundings + n_channels
-        words += 2 * 3 * k
+        words += 2 * links * k
     parts = (products, roundings, n_channels, 1)
     cycles = sum(count * each for count, each in zip(parts, CYCLES, strict=True))
     load = cycles * exported.study.electronics.sample_rate_hz / CLOCK

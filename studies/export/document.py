@@ -50,9 +50,9 @@ class Quantity(DocumentPart):
 class Masks(DocumentPart):
     """What is controlled."""
 
-    links: list[bool] = Field(min_length=3, max_length=3)
+    links: list[bool] = Field(description="per link", min_length=2, max_length=3)
     modes: list[list[bool]] = Field(
-        description="per link and mode (or patch)", min_length=3, max_length=3
+        description="per link and mode (or patch)", min_length=2, max_length=3
     )
 
 
@@ -129,12 +129,20 @@ def document(exported: FixedController, case_id: str = "") -> Document:
         order=ORDER,
         steps=_steps(controller.feedback),
         masks=Masks(
-            links=[k in exported.channels.link for k in range(3)],
-            modes=controller.feedback.acting.tolist(),
+            links=[k in exported.channels.link for k in range(exported.n_links)],
+            modes=_acting(exported).tolist(),
         ),
         numbers=_numbers(exported),
         study=json.loads(json.dumps(study.model_dump(mode="json"))),
     )
+
+
+def _acting(exported: FixedController) -> np.ndarray:
+    """Channels that act, (n, C); a linear system has none."""
+    feedback = exported.controller.feedback
+    if isinstance(feedback, StateSpace):
+        return np.zeros((exported.n_links, 0), bool)
+    return feedback.acting
 
 
 def _steps(feedback: Feedback) -> list[str]:

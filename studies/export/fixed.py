@@ -181,7 +181,7 @@ def design_fixed(
     b0, b1, a1 = channels.first.T
     one = np.ones_like(b0)
     tap = channels.force * (inner.step / force.step)[:, None]
-    back = np.zeros((3, exported.n_patches, len(channels.link)))
+    back = np.zeros((exported.n_links, exported.n_patches, len(channels.link)))
     back[channels.link, :, np.arange(len(channels.link))] = channels.synthesizer
     fixed = FixedPoint(
         wires=wires,
@@ -206,7 +206,7 @@ def design_fixed(
         synthesizer=find_row(back * force.step / dac_step, "synthesizer", word),
         is_rival=channels.is_rival,
         energy=_energy(channels, bound, inner, signal, memory, word),
-        error=ErrorBound(*np.zeros((3, 3, exported.n_patches))),
+        error=ErrorBound(*np.zeros((3, exported.n_links, exported.n_patches))),
     )
     return fixed._replace(error=_error_bound(exported, fixed, gains, memory))
 
@@ -427,7 +427,7 @@ def _error_bound(exported: FixedController, fixed: FixedPoint, gains: Gains, n: 
     wrong = wrong[:, None] * size + (signal * gains.force)[:, None] * np.abs(
         near.synthesizer - exact.synthesizer
     )
-    rounding, coefficients = np.zeros((2, 3, exported.n_patches))
+    rounding, coefficients = np.zeros((2, exported.n_links, exported.n_patches))
     np.add.at(rounding, exact.link, force[:, None] * size)
     np.add.at(coefficients, exact.link, wrong)
     inside = rounding + coefficients + half * fixed.wires.dac_step
@@ -444,12 +444,12 @@ def output_error_bound(exported: FixedController, error: np.ndarray) -> np.ndarr
     controller = exported.controller
     if not np.any(controller.feedthrough):
         return error
-    n = exported.n_patches
-    kick = np.broadcast_to(np.eye(n)[:, None], (n, 3, n))  # one actuator of each link at a time
+    links, n = exported.n_links, exported.n_patches
+    kick = np.broadcast_to(np.eye(n)[:, None], (n, links, n))  # one actuator of each link at a time
     linear = controller._replace(
         voltage_limit=np.inf, adc_bias=np.zeros(()), adc_step=np.ones(()), adc_gain=np.ones(())
     )
-    silent = np.zeros((ECHO, n, 3, n))
+    silent = np.zeros((ECHO, n, links, n))
     with np.errstate(over="ignore", invalid="ignore"):
         echo = respond_from(exported.channels, linear, silent, kick).command
     peak = np.abs(echo)

@@ -96,7 +96,7 @@ def design_blocks(
         state=state,
         advance=find_row(np.concatenate([within, entering], axis=3), "states", word),
         leave=find_row(np.concatenate([leaving, direct], axis=2), "outputs", word),
-        error=ErrorBound(*np.zeros((3, 3, exported.n_patches))),
+        error=ErrorBound(*np.zeros((3, exported.n_links, exported.n_patches))),
         anti_windup=None
         if system.anti_windup is None
         else find_row(system.anti_windup * wires.dac_step / step[..., None], "anti-windup", word),

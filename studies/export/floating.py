@@ -91,7 +91,7 @@ def _by_channels(
     b0, b1, a1 = channels.first.T
     d1, d2 = channels.denominator.T
     c0, c1, c2 = channels.force.T
-    back = np.zeros((3, *channels.synthesizer.shape))
+    back = np.zeros((codes.shape[-2], *channels.synthesizer.shape))
     back[link, np.arange(len(link))] = channels.synthesizer
     for code in codes:
         sensor = _sensor_volts(controller, code, command)

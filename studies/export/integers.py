@@ -65,7 +65,7 @@ def respond(fixed: FixedPoint | FixedBlocks, codes: np.ndarray, rail: int) -> Re
     command = np.zeros(codes.shape[1:], np.int64)
     at_end = np.zeros(codes.shape[1:], np.int64)  # samples at the highest code, or minus at 0
     is_faulty = np.zeros(many, bool)
-    is_used = np.isin(np.arange(3), fixed.link)[:, None]
+    is_used = np.isin(np.arange(codes.shape[-2]), fixed.link)[:, None]
     rows = []
     for code in codes.astype(np.int64):
         end = (code == wires.adc_top).astype(np.int64) - (code == 0)

@@ -98,7 +98,7 @@ def _check_clipping(exported: FixedController, run: LoopRun) -> None:
     """Reject a motion that the exported code would take for a broken sensor."""
     electronics = exported.study.electronics
     rail = rail_samples(electronics.sample_rate_hz)
-    used = np.isin(np.arange(3), exported.channels.link)[:, None]
+    used = np.isin(np.arange(exported.n_links), exported.channels.link)[:, None]
     for end in (0.0, float(exported.controller.adc_top)):
         count = np.cumsum((run.codes == end) & used, axis=0)
         within = count[rail - 1 :].copy()  # of the last `rail` samples

@@ -172,7 +172,7 @@ def _check_processor(pil: str, target: str, is_verified: bool | None) -> None:
 def _origin(exported: FixedController, case_id: str) -> list[str]:
     """Where a controller comes from, for file headers."""
     study = exported.study
-    links = "+".join(str(i + 1) for i in range(3) if study.control.links[i])
+    links = "+".join(str(i + 1) for i, is_on in enumerate(study.control.links) if is_on)
     package = f"{config.PACKAGE} {config.info()[config.PACKAGE]}"
     return [
         f"{study.title}",

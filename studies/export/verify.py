@@ -258,7 +258,7 @@ def load_code(
         reference: of the shaper.
     """
     sizes = (
-        3 * exported.n_patches,
+        exported.n_links * exported.n_patches,
         len(exported.channels.names),
         int(exported.taps.sample.max()) + 1,
     )

@@ -18,7 +18,7 @@ import numpy as np
 from jaxmodel import status
 from jaxmodel.beam import BASES
 from jaxmodel.case import Structure
-from jaxmodel.kinematics import lift, path_status
+from jaxmodel.kinematics import path_status
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.response import BenchPlant, bench_plant, held_modes
@@ -27,13 +27,12 @@ from studies.engine.programs import kept_jit
 from studies.errors import StudyError, field_error
 from studies.space.free import Place, Placing
 from studies.study.cases import as_arrays, build_structure, case_of, with_used
-from studies.study.consistency import each_link
 from studies.study.labels import describe
 from studies.study.numbers import Numbers, one_study
 from studies.study.signals import Signal
 from studies.study.spec import Study
 
-Pose = tuple[float, float, float]
+Pose = tuple[float, ...]
 #: Eigenvectors of worse condition are not used [1].
 WORST_CONDITION = 1e10
 #: Plants computed at once.
@@ -136,7 +135,7 @@ def with_outputs_at(study: Study, place: Place, places: tuple[float, ...]) -> tu
         place: puts parameters among the numbers.
         places: from the slider joint on, the same on all links, within the shortest one [m].
     """
-    longest = float(each_link(study.link.length).max())
+    longest = float(study.each_link(study.link.length).max())
     study = study.change(metrics__stations=tuple(x / longest for x in places))  # as many
     return study, Placing(_place_with_outputs, (place, places))
 
@@ -180,7 +179,7 @@ class Bench:
         if places and not BASES[study.link.basis].is_on_chord:
             raise field_error("link.basis", study.link.basis, "a basis with both ends on the chord")
         self.stations = tuple(sorted(set(places))) or (
-            float(each_link(study.link.length).min()) / 2,
+            float(study.each_link(study.link.length).min()) / 2,
         )
         study = study.change(control__feedback="none", shaper__kind="none")
         self.study, self.place = with_outputs_at(study, place, self.stations)
@@ -201,8 +200,8 @@ class Bench:
         Raises:
             StudyError: out of reach or singular.
         """
-        code, lifts = _reach(self.structure, self.numbers, np.array(pose))
-        check_pose(self.study, path, pose, int(code), np.asarray(lifts))
+        code = _reach(self.structure, self.numbers, np.array(pose))
+        check_pose(self.study, path, pose, int(code))
 
     def plant(self, pose: Pose, values: np.ndarray, has_slopes: bool) -> PlantAt:
         """The plant at a pose for some values of the parameters, (p,).
@@ -279,9 +278,9 @@ def with_slopes(
 
 
 @kept_jit(static_argnums=0)
-def _reach(structure: Structure, numbers: Numbers, pose: Array) -> tuple[Array, Array]:
+def _reach(structure: Structure, numbers: Numbers, pose: Array) -> Array:
     plant = prepare(structure, case_of(structure, numbers)).loop.plant
-    return path_status(plant, pose[None])[0], lift(plant, pose)
+    return path_status(plant, pose[None])[0]
 
 
 @kept_jit(static_argnums=(0, 1))

@@ -174,7 +174,7 @@ def _of_links(spec: FitSpec, problem: Problem, u: np.ndarray) -> list[Remedy]:
         section, _, name = field.partition(".")
         if field not in spec.fit.free or isinstance(getattr(spec.study.link, name), tuple):
             continue
-        own = [getattr(spec.study.link, name)] * 3
+        own = [getattr(spec.study.link, name)] * spec.study.n_links
         links = dict(spec.data.get(section, {})) | {name: own}
         try:
             apart = _problem_of(parse_fit(spec.data | {section: links}, spec.folder))

@@ -182,12 +182,11 @@ def _of_modes(plants: list[PlantAt]) -> tuple[str, np.ndarray, np.ndarray]:
 
 def _poses(bench: Bench) -> list[Pose]:
     """Home and poses around it that the machine reaches."""
-    x, y, phi = bench.study.motion.waypoints[0]
-    shifts = [(0.0, 0.0, 0.0), *((s * SHIFT, 0.0, 0.0) for s in (1, -1))]
-    shifts += [*((0.0, s * SHIFT, 0.0) for s in (1, -1)), *((0.0, 0.0, s * TURN) for s in (1, -1))]
+    home = np.array(bench.study.motion.waypoints[0])
+    steps = np.diag([SHIFT, SHIFT, TURN][: len(home)])
     kept = []
-    for dx, dy, turn in shifts:
-        pose = (x + dx, y + dy, phi + turn)
+    for shift in (np.zeros(len(home)), *(sign * step for step in steps for sign in (1, -1))):
+        pose = tuple((home + shift).tolist())
         try:
             bench.check(pose, "pose")
         except StudyError:
@@ -230,7 +229,7 @@ def _signals(bench: Bench, name: str, end: str) -> list[Signal]:
     if name == MODES:
         return []
     if name == "platform":
-        return [Signal(name, k, 0, np.nan) for k in range(3)]
+        return [Signal(name, k, 0, np.nan) for k in range(bench.study.n_pose)]
     is_patch = name in ("actuator", "sensor")
     place = np.nan
     if name in PLACED:
@@ -238,7 +237,7 @@ def _signals(bench: Bench, name: str, end: str) -> list[Signal]:
             return []
         place = bench.stations[len(bench.stations) // 2]
     patches = range(bench.n_patches if is_patch else 1)
-    return [Signal(name, i, k, place) for i, k in product(range(3), patches)]
+    return [Signal(name, i, k, place) for i, k in product(range(bench.study.n_links), patches)]
 
 
 def _about_modes(plant: PlantAt) -> np.ndarray:

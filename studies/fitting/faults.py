@@ -118,7 +118,7 @@ def _of_response(one: ComplexResponse, values: np.ndarray) -> Iterator[Fault]:
 def _of_trace(one: Trace, values: np.ndarray) -> Iterator[Fault]:
     yield Fault("its polarity is reversed", _times(one, -1.0))
     yield from _named_gains(one)
-    for text, signal in _others(one.signal, "sensor", one.n_patches):
+    for text, signal in _others(one.signal, "sensor", one.patches):
         yield Fault(text, _weighed(one, values, signal=signal))
 
     def shifted(delay: float) -> Trace:
@@ -188,17 +188,16 @@ def _other_channels(
 ) -> Iterator[Fault]:
     """Another sensor or actuator in place of the one that the file names."""
     source, output = one.signals
-    for text, signal in _others(output, "sensor", one.n_patches):
+    for text, signal in _others(output, "sensor", one.patches):
         yield Fault(text, _weighed(one, values, signals=(source, signal)))
-    for text, signal in _others(source, "actuator", one.n_patches):
+    for text, signal in _others(source, "actuator", one.patches):
         yield Fault(text, _weighed(one, values, signals=(signal, output)))
 
 
-def _others(own: Signal, kind: str, n_patches: int) -> Iterator[tuple[str, Signal]]:
+def _others(own: Signal, kind: str, patches: tuple[int, int]) -> Iterator[tuple[str, Signal]]:
     """What is said of each other signal of a kind, and it; none of other kinds."""
     if own.kind != kind:
         return
-    for link in range(3):
-        for patch in range(n_patches):
-            if (link, patch) != (own.link, own.patch):
-                yield f"its {kind} is {link + 1}.{patch + 1}", own._replace(link=link, patch=patch)
+    for link, patch in np.ndindex(patches):
+        if (link, patch) != (own.link, own.patch):
+            yield f"its {kind} is {link + 1}.{patch + 1}", own._replace(link=link, patch=patch)

@@ -87,7 +87,7 @@ def solve(problem: Problem, starts: int, refine: int, iterations: int, seed: int
     if not optima:
         raise StudyError("no starting point leads to a fit: each leaves where the model works")
     optima = distinct(optima)
-    images = exchanges(problem.free.numbers, [x.u for x in optima])
+    images = exchanges(problem.free.numbers, [x.u for x in optima], problem.bench.study.n_links)
     order = np.argsort(problem.costs(np.array(images).reshape(-1, len(own))))
     best = [images[k] for k in order[: EXCHANGED * refine]]
     optima = distinct(optima + descend_all(problem, best, iterations))
@@ -100,13 +100,16 @@ def solve(problem: Problem, starts: int, refine: int, iterations: int, seed: int
     return Solution(tuple(optima), len(first))
 
 
-def exchanges(numbers: Sequence[Free], places: Sequence[np.ndarray]) -> list[np.ndarray]:
+def exchanges(
+    numbers: Sequence[Free], places: Sequence[np.ndarray], n_links: int
+) -> list[np.ndarray]:
     """Further places, with the links' parameters permuted among the links or mirrored.
 
     Args:
-        numbers: free ones; those of a field of which all three entries are free within the same
-            bounds are exchanged.
+        numbers: free ones; those of a field whose entries are all free within the same bounds
+            are exchanged.
         places: optima between the bounds, each (p,).
+        n_links: of the mechanism.
     """
     fields: dict[tuple[Any, ...], dict[int, int]] = {}
     for k, one in enumerate(numbers):
@@ -114,12 +117,13 @@ def exchanges(numbers: Sequence[Free], places: Sequence[np.ndarray]) -> list[np.
         if entry is not None and entry.indices:
             key = entry.field, entry.indices[1:], one.span
             fields.setdefault(key, {})[entry.indices[0]] = k
-    links = np.array([[x[i] for i in range(3)] for x in fields.values() if set(x) == {0, 1, 2}])
+    every = range(n_links)
+    links = np.array([[x[i] for i in every] for x in fields.values() if set(x) == set(every)])
     images: list[np.ndarray] = []
     for u in places if len(links) else ():
         mirrored = np.clip(2 * u[links].mean(axis=1, keepdims=True) - u[links], 0, 1)
         near = max(SAME, ALIKE * float(np.ptp(u[links], axis=1).max()))
-        for positions, order in product((u[links], mirrored), permutations(range(3))):
+        for positions, order in product((u[links], mirrored), permutations(every)):
             changed = u.copy()
             changed[links] = positions[:, order]
             if not _is_among(changed, [*places, *images], near):

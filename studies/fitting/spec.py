@@ -20,20 +20,27 @@ from studies.space.free import (
     join_numbers,
     plain_numbers,
 )
-from studies.study.consistency import each_link, patch_centers
+from studies.study.consistency import patch_centers
 from studies.study.explain import explain
 from studies.study.files import find_spec, read_toml
 from studies.study.paths import as_tuples, field_unit, parse_entry
 from studies.study.signals import INPUTS, OUTPUTS, Signal, parse_signal
-from studies.study.spec import DESIGN, MACHINE, Section, Study, described, parse_study
+from studies.study.sizes import lengths
+from studies.study.spec import (
+    DESIGN,
+    MACHINE,
+    OneALink,
+    Pose,
+    Section,
+    Study,
+    described,
+    parse_study,
+)
 from studies.study.window import with_window
 
 Positive = Annotated[float, Field(ge=1e-30, le=1e12)]
 Percent = Annotated[float, Field(ge=1e-6, le=1000)]
 Share = Annotated[float, Field(ge=1e-6, lt=100)]
-Coordinate = Annotated[float, Field(ge=-10, le=10)]
-Pose = tuple[Coordinate, Coordinate, Coordinate]
-Flags = tuple[bool, bool, bool]
 
 
 #: Fewer samples say nothing.
@@ -214,7 +221,9 @@ class SettlingEntry(OutputEntry):
     band_percent: Share | None = described(
         None, "%", "the same, over the largest value after the reference trajectory without control"
     )
-    links: Flags | None = described(None, "-", "under control; default: those of the study")
+    links: OneALink[bool] | None = described(
+        None, "-", "under control; default: those of the study"
+    )
 
 
 class FiguresEntry(Common, NoiseEntry):
@@ -233,7 +242,9 @@ class FiguresEntry(Common, NoiseEntry):
     modes: int | None = described(
         None, "1", "controlled modes; default: those of the study", ge=1, le=12
     )
-    links: Flags | None = described(None, "-", "under control; default: those of the study")
+    links: OneALink[bool] | None = described(
+        None, "-", "under control; default: those of the study"
+    )
 
 
 #: Fields of each kind.
@@ -307,7 +318,7 @@ def own_signal(study: Study, name: str, end: str) -> Signal | None:
     """
     kinds = {"inputs": INPUTS, "outputs": OUTPUTS}[end]
     if " " in name:
-        n_patches, length = patch_centers(study).shape[1], each_link(study.link.length)
+        n_patches, length = patch_centers(study).shape[1], study.each_link(study.link.length)
         return parse_signal(name, kinds, n_patches, length, f"fit.next.{end}")
     allowed = [
         *kinds,
@@ -361,15 +372,16 @@ def parse_fit(data: dict[str, Any], folder: str | Path = ".") -> FitSpec:
     if "fit" not in data:
         raise StudyError("fit: missing; a fit is a study file with a section [fit]")
     study = with_window(parse_study({name: value for name, value in data.items() if name != "fit"}))
+    sizes = lengths(study.mechanism)
     try:
-        fit = Fit.model_validate(as_tuples(data["fit"]))
+        fit = Fit.model_validate(as_tuples(data["fit"]), context=sizes)
     except ValidationError as error:
-        raise explain(error, Fit, data["fit"], inside="fit") from None
+        raise explain(error, Fit, data["fit"], "fit", sizes) from None
     check_run(study)
     if 0 < fit.samples < FEWEST_SAMPLES:
         raise field_error("fit.samples", fit.samples, f"0, or {FEWEST_SAMPLES} to 1000000")
     free, priors = _free(fit, study)
-    entries = tuple(_entry(written, k) for k, written in enumerate(fit.data))
+    entries = tuple(_entry(written, k, study) for k, written in enumerate(fit.data))
     if all(entry.check for entry in entries):
         raise StudyError("fit.data: every entry is held out by check = true; leave one or more in")
     return FitSpec(
@@ -428,17 +440,17 @@ def _prior(written: dict[str, Any], k: int, path: str, span: Range) -> Prior:
     return Prior(k, float(written["mean"]), float(written["sigma"]))
 
 
-def _entry(written: dict[str, Any], k: int) -> Common:
+def _entry(written: dict[str, Any], k: int, study: Study) -> Common:
     path = f"fit.data[{k}]"
     kind = written.get("kind")
     if not isinstance(kind, str) or kind not in ENTRIES:
         hint = nearest(kind, ENTRIES) if isinstance(kind, str) else ""
         raise field_error(f"{path}.kind", kind, ", ".join(ENTRIES), hint=hint)
-    model = ENTRIES[kind]
+    model, sizes = ENTRIES[kind], lengths(study.mechanism)
     try:
-        entry = model.model_validate(as_tuples(written))
+        entry = model.model_validate(as_tuples(written), context=sizes)
     except ValidationError as error:
-        raise explain(error, model, written, inside=path) from None
+        raise explain(error, model, written, path, sizes) from None
     is_bare = isinstance(entry, NoiseEntry) and entry.sigma is None and entry.sigma_percent is None
     if is_bare:
         raise StudyError(

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from studies.study.consistency import each_link
 from studies.study.paths import known_field
 from studies.study.spec import Study
 
@@ -46,7 +45,7 @@ def machines_of(study: Study, count: int, seed: int) -> list[dict[str, Any]]:
     from scipy.stats import qmc
 
     spread = spread_of(study)
-    sizes = {name: 3 if name.startswith("link.") else 1 for name in spread}
+    sizes = {name: study.n_links if name.startswith("link.") else 1 for name in spread}
     points = qmc.LatinHypercube(sum(sizes.values()), rng=seed).random(count)
     machines: list[dict[str, Any]] = [{"run.seed": study.run.seed + 1 + k} for k in range(count)]
     first = 0
@@ -54,9 +53,9 @@ def machines_of(study: Study, count: int, seed: int) -> list[dict[str, Any]]:
         factor = 1 + spread[name] / 100 * (2 * points[:, first : first + size] - 1)
         first += size
         value = known_field(name, study, "laws")
-        each = factor * (each_link(value) if size == 3 else value)
+        each = factor * (study.each_link(value) if size > 1 else value)
         for machine, row in zip(machines, each.tolist(), strict=True):
-            machine[name] = row if size == 3 else row[0]
+            machine[name] = row if size > 1 else row[0]
     for machine in machines:
         machine["drive.model_mass"] = _known_mass(study, machine)
     return machines

@@ -27,7 +27,7 @@ from studies.engine.programs import kept_jit
 from studies.engine.runs import judged_status, run_study
 from studies.engine.stability import LoopFigures, loop_report
 from studies.study.files import READY
-from studies.study.spec import Flags, Study, load_study
+from studies.study.spec import Study, load_study
 
 #: Executor. A kernel would take longer to trace than the scan takes for these few cases
 #: (docs/performance.md).
@@ -79,7 +79,7 @@ class PaperCase(NamedTuple):
     move: str  # key of MOVES
     shaper: str
     modes: int  # modes separated by the modal filter, 3 in section 4, 2 in section 5
-    links: Flags = OFF  # controlled
+    links: tuple[bool, ...] = OFF  # controlled
     ratio_from: str = "none"  # "own run", a key of GIVEN_RATIOS, "none"
     gain_factor: float = 1.0  # on the machine's gains
     feedback: str = "sampled"

@@ -15,7 +15,6 @@ from markupsafe import Markup
 from studies.paper.cases import ALL, COMPARED, EXPERIMENT_RATIOS, MOVES, OFF, PAPER_RATIOS
 from studies.paper.context import PLACES, Context, Machines, change, residual, residuals
 from studies.show.units import count_text
-from studies.study.consistency import each_link
 from studies.study.labels import describe
 from studies.study.margin import margin_text
 from studies.study.printed import TABLE_1
@@ -51,7 +50,7 @@ def machine_rows(machines: Machines) -> list[list[str]]:
         gains = study.control.gain_factor * np.array(study.control.velocity_gain)
         n_moves = len(study.motion.waypoints) - 1
         return [
-            _join_numbers(each_link(study.link.youngs_modulus) / 1e9),
+            _join_numbers(study.each_link(study.link.youngs_modulus) / 1e9),
             f"{study.link.joint_inertia_c:.3g}",
             _join_numbers(np.atleast_1d(study.link.damping_ratio), ".2g"),
             f"{study.drive.kp:.3g}, {study.drive.kd:.3g}",

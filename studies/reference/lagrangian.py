@@ -50,7 +50,7 @@ def guides(geometry: prrr.GuideGeometry) -> tuple[jax.Array, jax.Array, jax.Arra
 def pivots(geometry: Any) -> jax.Array:
     """A_i of the cranks [m], (n, 2)."""
     if isinstance(geometry, five_bar.FiveBarGeometry):
-        return jnp.array([[-0.5, 0.0], [0.5, 0.0]]) * geometry.pivot_distance
+        return jnp.array([[-1.0, 0.0], [1.0, 0.0]]) * geometry.pivot_distance
     angle = geometry.pivot_angle
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1) * jnp.reshape(
         geometry.pivot_radius, (-1, 1)

@@ -24,10 +24,10 @@ POINTS = 41
 class Skeleton(NamedTuple):
     """Positions of all parts, (T, ...) in metres."""
 
-    carrier: np.ndarray  # ends of guides or cranks, (T, 3, 2, 2)
-    slider: np.ndarray  # B, (T, 3, 2)
-    joint: np.ndarray  # C, (T, 3, 2)
-    link: np.ndarray  # points along the links, (T, 3, points, 2)
+    carrier: np.ndarray  # ends of guides or cranks, (T, n, 2, 2)
+    slider: np.ndarray  # B, (T, n, 2)
+    joint: np.ndarray  # C, (T, n, 2)
+    link: np.ndarray  # points along the links, (T, n, points, 2)
 
 
 def skeleton(study: Study, pose: np.ndarray, q: np.ndarray, exaggeration: float) -> Skeleton:
@@ -35,8 +35,8 @@ def skeleton(study: Study, pose: np.ndarray, q: np.ndarray, exaggeration: float)
 
     Args:
         study: the machine.
-        pose: (x, y, phi) [m, m, rad], (T, 3).
-        q: modal coordinates of the plant [m], (T, 3, R).
+        pose: (x, y, phi) [m, m, rad], (T, p).
+        q: modal coordinates of the plant [m], (T, n, R).
         exaggeration: factor on the bending [1].
     """
     structure, case = check_run(study.change(link__modes=q.shape[-1], control__feedback="none"))

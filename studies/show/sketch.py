@@ -9,11 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from jaxmodel.case import Case
 from studies.show import figures
-from studies.study.cases import build_case
-from studies.study.consistency import each_link, patch_centers
-from studies.study.geometry import far_arms, machine_geometry
+from studies.study.consistency import patch_centers
+from studies.study.geometry import far_joints, machine_geometry
 from studies.study.spec import Study
 
 #: Colours of controlled links, other links, actuators and sensors.
@@ -24,28 +22,28 @@ CAPTION = (
     "sensors, on opposite faces, red: the path of the platform's reference point, enlarged where "
     "it is short, black cross: a payload's centre of mass"
 )
-#: How far patches stand out of a link of the whole machine, as a share of the guides' side.
+#: How far patches stand out of a link of the whole machine, as a share of the machine's size.
 OUTSTANDING = 0.018
 #: Largest thickness drawn, as a share of the longest link, and factors on true thickness.
 THICKEST, FACTORS = 0.1, (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100)
-#: The path is drawn at least this long, as a share of the guides' side.
+#: The path is drawn at least this long, as a share of the machine's size.
 SHORTEST_PATH = 0.08
 
 
 def sketch(study: Study) -> Figure:
-    """Guides, sliders, links with their patches, platform and path; links to scale below."""
-    case, pose = build_case(study), np.array(study.motion.waypoints[0], float)
-    slider, joint = standing(case, pose)
+    """The machine with its patches, platform and path; links to scale below."""
+    pose = np.array(study.motion.waypoints[0], float)
+    near, joint = standing(study, pose)
     figure = Figure(figsize=(3.4, 5.2), layout="constrained")
     ax: Axes
     ax, below = figure.subplots(2, 1, height_ratios=(3.0, 2.2))
-    _carriers(ax, case, slider)
+    _carriers(ax, study, near)
     ax.fill(*(1e3 * joint.T), color="#DDDDDD", zorder=1)
-    for i, (start, end) in enumerate(zip(slider, joint, strict=True)):
+    for i, (start, end) in enumerate(zip(near, joint, strict=True)):
         _link(ax, study, i, start, end)
-    ax.plot(*(1e3 * slider.T), "s", color="#333333", markersize=6, zorder=4)
+    ax.plot(*(1e3 * near.T), "s", color="#333333", markersize=6, zorder=4)
     ax.plot(*(1e3 * joint.T), "o", color="#333333", markersize=3, zorder=4)
-    for i, start in enumerate(slider):
+    for i, start in enumerate(near):
         away = (start - joint.mean(axis=0)) / np.linalg.norm(start - joint.mean(axis=0))
         ax.annotate(
             str(i + 1),
@@ -67,17 +65,17 @@ def sketch(study: Study) -> Figure:
     return figure
 
 
-def standing(case: Case, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Joints B and C [m] of straight links at a pose, (3, 2) each; NaN out of reach."""
-    geometry, length = case.machine.geometry, each_link(case.machine.beam.length)
-    joint = pose[:2] + far_arms(geometry, pose[2])
+def standing(study: Study, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Joints B and C [m] of straight links at a pose, (n, 2) each; NaN out of reach."""
+    (geometry, _), length = machine_geometry(study), study.each_link(study.link.length)
+    joint, _ = far_joints(geometry, pose, study.n_links)
     near = geometry.legs(np).near(*joint.T, length**2, 0.0, np)
     away = np.stack(near.to_far(), axis=1)
     return np.where(near.root_squared[:, None] < 0, np.nan, joint - away), joint
 
 
-def _carriers(ax: Axes, case: Case, near: np.ndarray) -> None:
-    for line in case.machine.geometry.legs(np).carriers(near):
+def _carriers(ax: Axes, study: Study, near: np.ndarray) -> None:
+    for line in machine_geometry(study)[0].legs(np).carriers(near):
         ax.plot(*(1e3 * line.T), color="#BBBBBB", linewidth=3, zorder=0)
 
 
@@ -89,8 +87,8 @@ def _link(ax: Axes, study: Study, i: int, start: np.ndarray, end: np.ndarray) ->
     out = OUTSTANDING * machine_geometry(study)[0].size() * np.array([-along[1], along[0]])
     patches = study.patches
     for size, color, side in (
-        (each_link(patches.actuator_length)[i], ACTUATOR, out),
-        (each_link(patches.sensor_length)[i], SENSOR, -out),
+        (study.each_link(patches.actuator_length)[i], ACTUATOR, out),
+        (study.each_link(patches.sensor_length)[i], SENSOR, -out),
     ):
         for center in patch_centers(study)[i]:
             first, last = (start + (center + x) * along for x in (-size / 2, size / 2))
@@ -117,12 +115,12 @@ def link_parts(study: Study, i: int) -> list[Part]:
     """Link i and its patches; the longer ones of a pair come first."""
     link, patches = study.link, study.patches
     length, width, thickness = (
-        float(each_link(x)[i]) for x in (link.length, link.width, link.thickness)
+        float(study.each_link(x)[i]) for x in (link.length, link.width, link.thickness)
     )
-    across, ceramic = (float(each_link(x)[i]) for x in (patches.width, patches.thickness))
+    across, ceramic = (float(study.each_link(x)[i]) for x in (patches.width, patches.thickness))
     kinds = [
-        (float(each_link(patches.actuator_length)[i]), ACTUATOR, thickness / 2),
-        (float(each_link(patches.sensor_length)[i]), SENSOR, -thickness / 2 - ceramic),
+        (float(study.each_link(patches.actuator_length)[i]), ACTUATOR, thickness / 2),
+        (float(study.each_link(patches.sensor_length)[i]), SENSOR, -thickness / 2 - ceramic),
     ]
     body = Part(
         color=_color(study, i),
@@ -148,7 +146,7 @@ def link_parts(study: Study, i: int) -> list[Part]:
 
 def _links_to_scale(ax: Axes, study: Study) -> None:
     """Faces and edges of the links, one below another, in millimetres."""
-    links = [link_parts(study, i) for i in range(3)]
+    links = [link_parts(study, i) for i in range(study.n_links)]
     height = max(parts[0].thickness + 2 * parts[-1].thickness for parts in links)
     longest = max(parts[0].length for parts in links)
     factor = max((x for x in FACTORS if x * height <= THICKEST * longest), default=FACTORS[0])

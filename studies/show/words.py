@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxmodel.laws import LAWS
 from studies.show.units import count_text, span
-from studies.study.consistency import each_link, patch_centers
+from studies.study.consistency import patch_centers
 from studies.study.spec import Study
 
 
@@ -42,7 +42,7 @@ def motion_text(study: Study) -> str:
 
 def machine_text(study: Study) -> str:
     """Links and patches, in words."""
-    lengths = f"links of {span(1e3 * each_link(study.link.length))} mm"
+    lengths = f"links of {span(1e3 * study.each_link(study.link.length))} mm"
     pairs = patch_centers(study).shape[1]
     return f"{lengths}, {count_text(pairs, 'patch pair')} each" if pairs else lengths
 
@@ -55,7 +55,7 @@ def baseline_text(study: Study) -> str:
 def control_text(study: Study) -> str:
     """What is controlled and how, in words."""
     control = study.control
-    links = [str(i + 1) for i in range(3) if control.links[i]]
+    links = [str(i + 1) for i, is_on in enumerate(control.links) if is_on]
     if control.feedback == "none" or not links:
         return "no link controlled"
     law = LAWS[control.law]

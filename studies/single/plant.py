@@ -130,7 +130,9 @@ def _check_sampled(study: Study) -> None:
 
 def _ports(structure: Structure) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of actuators and of sensors."""
-    ports = [f"{i + 1}.{k + 1}" for i in range(3) for k in range(structure.n_patches)]
+    ports = [
+        f"{i + 1}.{k + 1}" for i in range(structure.n_links) for k in range(structure.n_patches)
+    ]
     return tuple(f"actuator {x}" for x in ports), tuple(f"sensor {x}" for x in ports)
 
 

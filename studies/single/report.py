@@ -62,6 +62,7 @@ def report(
     result, study = run.result, run.study
     worst = int(np.argmax(np.nan_to_num(result.metrics.residual_rms.max(axis=1), nan=-1.0)))
     free = twin if twin is not None and twin.status in status.FINISHED else None
+    links = range(study.n_links)
     return page(
         "single/report.html",
         folder,
@@ -81,8 +82,8 @@ def report(
         worst=worst,
         rms=result.metrics.residual_rms.max(axis=1),
         free_rms=free.result.metrics.residual_rms.max(axis=1) if free else None,
-        settled=[settling_text(run, link) for link in range(3)],
-        free_settled=[settling_text(free, link) for link in range(3)] if free else [],
+        settled=[settling_text(run, link) for link in links],
+        free_settled=[settling_text(free, link) for link in links] if free else [],
         later=_settling_delay(run, free, worst) if free else "",
         verdict=VERDICTS,
         caution=caution(run.loop.gain_margin) if run.loop is not None else "",
@@ -137,8 +138,9 @@ def _platform(run: Run) -> list[list[str]]:
     record = run.result.record
     assert record is not None
     largest = np.abs(record.pose_error).max(axis=0)
-    errors = largest, metrics.pose_error_rms, metrics.stretch_error_peak
-    return [[name, *(number(error[k], "m") for error in errors)] for k, name in enumerate(_POSE)]
+    errors = zip(largest, metrics.pose_error_rms, metrics.stretch_error_peak, strict=True)
+    rows = zip(_POSE, errors, strict=False)
+    return [[name, *(number(error, "m") for error in own)] for name, own in rows]
 
 
 def _largest_deviation(run: Run) -> tuple[float, float]:
@@ -146,7 +148,9 @@ def _largest_deviation(run: Run) -> tuple[float, float]:
     record = run.result.record
     assert record is not None
     error = record.pose_error
-    return float(np.hypot(error[:, 0], error[:, 1]).max()), float(np.abs(error[:, 2]).max())
+    return float(np.hypot(error[:, 0], error[:, 1]).max()), float(
+        np.abs(error[:, 2:]).max(initial=0.0)
+    )
 
 
 def _modes(run: Run) -> list[list[str]]:
@@ -165,8 +169,12 @@ def draw(run: Run, twin: Run | None = None) -> dict[str, Figure]:
     record = run.result.record
     assert record is not None
     pairs = [f"pair {k + 1}" for k in range(record.actuator_voltage.shape[2])]
-    error = [(label, 1e6 * record.pose_error[:, [k]]) for k, label in enumerate(_POSE)]
-    voltage = [(f"link {i + 1} [V]", record.actuator_voltage[:, i]) for i in range(3)]
+    error = [
+        (label, 1e6 * x[:, None]) for label, x in zip(_POSE, record.pose_error.T, strict=False)
+    ]
+    voltage = [
+        (f"link {i + 1} [V]", record.actuator_voltage[:, i]) for i in range(run.study.n_links)
+    ]
     return {
         "deflection": _deflection(run, twin),
         "error": _over_time(run, error, []),

@@ -37,7 +37,9 @@ def link_rows(run: Run, twin: Run | None = None) -> Rows:
     add("residual peak", "m", metrics.residual_peak)
     if record is not None:
         add("peak of the run", "m", np.abs(record.chord_deflection_stations).max(axis=0))
-    columns[headed("settling time", "s")] = [settling_text(run, link) for link in range(3)]
+    columns[headed("settling time", "s")] = [
+        settling_text(run, link) for link in range(run.study.n_links)
+    ]
     add("peak voltage", "V", metrics.peak_voltage)
     add("peak motor force", "N", metrics.peak_force)
     return Rows(list(columns), [list(row) for row in zip(*columns.values(), strict=True)])

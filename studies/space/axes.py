@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxmodel.laws.state_space import STATE_SPACE
 from studies.errors import field_error, nearest, shown_name
-from studies.study.consistency import each_link, patch_centers, patch_pitch
+from studies.study.consistency import patch_centers, patch_pitch
 from studies.study.fields import Columns
 from studies.study.paths import checked_value, field_choices, known_field
 from studies.study.spec import Study
@@ -58,6 +58,8 @@ SHOWN_AS = ALIASES | {
 PLACEMENTS = ("same", "mirrored", "per_link")
 #: Numbers beyond this are refused.
 LARGEST = 1e150
+#: Most modes of all links of which every subset becomes a case.
+MOST_MASKED = 15
 #: More values than this from one axis or block are refused.
 LIMIT = 10**7
 
@@ -278,7 +280,9 @@ def _frequency_error(written: Any, study: Study, path: str) -> Axis:
 
 
 def _link_subsets(written: Any, study: Study, path: str) -> Axis:
-    names = ["none", "1", "2", "3", "1+2", "1+3", "2+3", "1+2+3"]
+    numbers = [str(i + 1) for i in range(study.n_links)]
+    subsets = (combinations(numbers, size) for size in range(study.n_links + 1))
+    names = ["+".join(subset) or "none" for some in subsets for subset in some]
     chosen = names if written == "all" else written
     if not isinstance(chosen, list) or not chosen:
         raise field_error(path, written, "'all', or a list of " + ", ".join(names))
@@ -286,17 +290,18 @@ def _link_subsets(written: Any, study: Study, path: str) -> Axis:
         if value not in names:
             hint = nearest(str(value), names)
             raise field_error(path, value, ", ".join(names), hint=hint)
-    flags = np.array([[str(i) in name for i in (1, 2, 3)] for name in chosen])
+    flags = np.array([[number in name for number in numbers] for name in chosen])
     return choice_axis({"control.links": flags, "link_subsets": np.array(chosen)})
 
 
 def _link_mode_masks(written: Any, study: Study, path: str) -> Axis:
     if written != "all":
         raise field_error(path, written, "'all' (list values under control.mode_mask instead)")
-    modes = study.control.modes
-    if 3 * modes > 15:
-        raise field_error(path, written, f"control.modes up to 5 here; it is {modes}")
-    bits = np.array(list(product((False, True), repeat=3 * modes))).reshape(-1, 3, modes)
+    links, modes = study.n_links, study.control.modes
+    most = MOST_MASKED // links
+    if modes > most:
+        raise field_error(path, written, f"control.modes up to {most} here; it is {modes}")
+    bits = np.array(list(product((False, True), repeat=links * modes))).reshape(-1, links, modes)
     text = ["/".join("".join(str(int(b)) for b in row) for row in mask) for mask in bits]
     return choice_axis({"control.mode_mask": bits, "link_mode_masks": np.array(text)})
 
@@ -314,7 +319,7 @@ def _placement(written: Any, study: Study, path: str) -> Axis:
     if isinstance(candidates, bool) or not isinstance(candidates, int) or not 0 <= candidates <= 60:
         raise field_error(f"{path}.candidates", candidates, "a whole number from 1 to 60", "1")
     count = patch_centers(study).shape[1]
-    lengths, pitches = each_link(study.link.length), patch_pitch(study)
+    lengths, pitches = study.each_link(study.link.length), patch_pitch(study)
     if kind == "per_link":
         if candidates:
             raise field_error(f"{path}.candidates", candidates, "0 with kind per_link")
@@ -324,10 +329,10 @@ def _placement(written: Any, study: Study, path: str) -> Axis:
         ]
 
         def sample(u: np.ndarray) -> Columns:
-            rows = [rooms[i].place(u[:, i * count : (i + 1) * count]) for i in range(3)]
+            rows = [rooms[i].place(u[:, i * count : (i + 1) * count]) for i in range(study.n_links)]
             return {"patches.centers": np.stack(rows, axis=1)}
 
-        return Axis(3 * count, sample, None)
+        return Axis(study.n_links * count, sample, None)
     if kind == "mirrored" and np.ptp(lengths) > 0:
         raise field_error(
             f"{path}.kind", kind, f"'same' or 'per_link' with link.length = {list(lengths)}"

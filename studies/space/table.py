@@ -307,7 +307,7 @@ def _varying_text(study: Study, columns: Columns) -> dict[str, list[str]]:
         if entry is None or not entry.indices:
             continue
         base = whole.get(entry.field) or [known_field(entry.field, study)] * len(column)
-        base = [as_list(entry.field, value) for value in base]
+        base = [as_list(entry.field, value, study.n_links) for value in base]
         whole[entry.field] = [
             replaced(value, entry.indices, new)
             for value, new in zip(base, column.tolist(), strict=True)
@@ -326,6 +326,6 @@ def _seeds(study: Study, columns: Columns, ids: np.ndarray) -> np.ndarray:
     return np.fromiter((int.from_bytes(d, "big") % 10**9 for d in digests), np.int64, len(ids))
 
 
-def as_numbers(column: np.ndarray) -> np.ndarray:
+def as_numbers(column: np.ndarray, n_links: int) -> np.ndarray:
     """A column as an array for a file: lists of unequal length padded with NaN."""
-    return padded(list(column)) if column.dtype == object else column
+    return padded(list(column), n_links) if column.dtype == object else column

@@ -9,6 +9,7 @@ import numpy as np
 from jaxmodel.beam import BASES
 from jaxmodel.controller import linear_parts
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
+from jaxmodel.state_space import StateSpace
 from studies.engine.breaking import BreakingChange
 from studies.engine.controller import FixedController, fixed_controller
 from studies.engine.host_loop import SampledLoop, name_motion
@@ -26,7 +27,6 @@ from studies.spillover.plants import (
     plant_sizes,
 )
 from studies.spillover.proofs import Proofs
-from studies.study.consistency import each_link
 from studies.study.margin import hysteresis_text
 from studies.study.spec import Study
 from studies.threads import serial_blas
@@ -163,7 +163,7 @@ def certify(
     if not 1 < margin <= 32:
         raise field_error("--margin", margin, "more than 1, up to 32", "1")
     design = fixed_controller(study)
-    nominal = each_link(design.study.link.joint_inertia_c)
+    nominal = design.study.each_link(design.study.link.joint_inertia_c)
     mismatches = tuple(
         d for d in mismatches if d.joint_inertia is None or np.any(d.joint_inertia != nominal)
     )
@@ -246,13 +246,14 @@ def _certificate(
     shape, largest = plants.shape, max(plant.n_modes for plant in plants.ravel())
     exists = faults == ""
     law = pad_channels(design.controller, design.n_patches)
-    channels = design.controller.feedback.acting.shape[1]
+    feedback, links = design.controller.feedback, design.structure.n_links
+    channels = 0 if isinstance(feedback, StateSpace) else feedback.acting.shape[1]
 
     radius, limit = np.full((2, *shape), np.nan)
-    frequency, zeta, free = np.full((3, *shape, largest, 3), np.nan)
+    frequency, zeta, free = np.full((3, *shape, largest, links), np.nan)
     weakest, breaking = np.full((2, *shape), "", object)
-    observation = np.full((*shape[:2], 3, channels, largest), np.nan)
-    actuation = np.full((*shape[:2], 3, largest, channels), np.nan)
+    observation = np.full((*shape[:2], links, channels, largest), np.nan)
+    actuation = np.full((*shape[:2], links, largest, channels), np.nan)
     for at, (figures, free_damping, *texts) in judgements.items():
         n = plants[at].n_modes
         radius[at], limit[at] = figures.spectral_radius, figures.gain_margin

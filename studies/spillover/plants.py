@@ -15,13 +15,15 @@ import numpy as np
 
 from jaxmodel.beam import BASES
 from jaxmodel.case import Case, Structure
-from jaxmodel.controller import Controller
+from jaxmodel.controller import Controller, Feedback
 from jaxmodel.laws.srf import SRF
 from jaxmodel.linear import resting
+from jaxmodel.loop import Loop
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import placement_faults
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopMatrices, loop_matrices
+from jaxmodel.state_space import StateSpace
 from studies.engine.controller import FixedController
 from studies.engine.host_loop import SampledLoop, sampled_loop
 from studies.engine.programs import kept_jit
@@ -79,8 +81,8 @@ class PlantVariant(NamedTuple):
 class SpilloverGains(NamedTuple):
     """Coupling between channels and plant modes, in the scale of the plant's basis."""
 
-    observation: Array  # channel signal per modal coordinate, filter x sensor, (3, C, R)
-    actuation: Array  # modal force per channel force, actuator x synthesizer, (3, R, C)
+    observation: Array  # channel signal per modal coordinate, filter x sensor, (n, C, R)
+    actuation: Array  # modal force per channel force, actuator x synthesizer, (n, R, C)
 
 
 _placement_faults = jax.jit(placement_faults)
@@ -96,7 +98,9 @@ class LoopBuilder:
         """
         self._design = design
         self._case = design.case._replace(
-            initial=design.case.initial._replace(modal=np.zeros((3, LARGEST)))
+            initial=design.case.initial._replace(
+                modal=np.zeros((design.structure.n_links, LARGEST))
+            )
         )
         self._pose = np.array(design.study.motion.waypoints[0], float)
 
@@ -119,7 +123,7 @@ class LoopBuilder:
     def loop(self, plant: PlantVariant, law: Controller) -> SampledLoop:
         """The loop of a plant and a controller with a channel for each patch (`pad_channels`)."""
         matrices, omega, _ = self._evaluate(plant, law)
-        kept, of_plant = _kept_states(matrices, plant.n_modes)
+        kept, of_plant = _kept_states(matrices, self._design.structure, plant.n_modes)
         matrices = matrices._replace(
             open=matrices.open[np.ix_(kept, kept)],
             feedback=matrices.feedback[np.ix_(kept, kept)],
@@ -200,21 +204,33 @@ def _evaluate_loop(
     structure: Structure, case: Case, pose: Array, law: Controller
 ) -> tuple[LoopMatrices, Array, SpilloverGains]:
     loop = prepare(structure, case).loop
-    observation = jnp.einsum("ick,ikr->icr", law.feedback.filter, loop.sensor)
-    force = loop.plant.modal_mass[:, None, None] * loop.actuator
-    actuation = jnp.einsum("irk,ikc->irc", force, law.feedback.synthesizer)
-    gains = SpilloverGains(observation, actuation)
+    gains = _gains(loop, law.feedback)
     at_rest = resting(structure, case)
     matrices = loop_matrices(structure, case, loop, law, pose, at_rest)
     return matrices, loop.omega, gains
 
 
-def _kept_states(matrices: LoopMatrices, n_modes: int) -> tuple[np.ndarray, np.ndarray]:
+def _gains(loop: Loop, feedback: Feedback) -> SpilloverGains:
+    """Of its channels, of which a linear system has none."""
+    if isinstance(feedback, StateSpace):
+        links, modes = loop.omega.shape
+        return SpilloverGains(jnp.zeros((links, 0, modes)), jnp.zeros((links, modes, 0)))
+    force = loop.plant.modal_mass[:, None, None] * loop.actuator
+    return SpilloverGains(
+        jnp.einsum("ick,ikr->icr", feedback.filter, loop.sensor),
+        jnp.einsum("irk,ikc->irc", force, feedback.synthesizer),
+    )
+
+
+def _kept_states(
+    matrices: LoopMatrices, structure: Structure, n_modes: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Entries of the loop's and the plant's state that exist with fewer modes."""
+    first, rows = 2 * structure.n_pose, 2 * structure.n_links  # of the modes: values and rates
 
     def entries(size: int) -> np.ndarray:
         is_kept = np.ones(size, bool)
-        modes = is_kept[6 : 6 + 6 * LARGEST].reshape(6, LARGEST)
+        modes = is_kept[first : first + rows * LARGEST].reshape(rows, LARGEST)
         modes[:, n_modes:] = False
         return np.flatnonzero(is_kept)
 

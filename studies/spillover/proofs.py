@@ -269,10 +269,10 @@ def volume(cells: Cells, ranges: np.ndarray, steps: int = 64) -> float:
 
     Args:
         cells: undecided ones.
-        ranges: low and high of stiffness, delay and payload, (3, 2).
+        ranges: low and high of stiffness, delay and payload, one row each.
         steps: of the grid along each.
     """
-    grid = np.zeros((steps,) * 3, bool)
+    grid = np.zeros((steps,) * len(ranges), bool)
     width = ranges[:, 1] - ranges[:, 0]
     first = np.floor((cells.low[:, 1:4] - ranges[:, 0]) / width * steps + 1e-9).astype(int)
     last = np.ceil((cells.high[:, 1:4] - ranges[:, 0]) / width * steps - 1e-9).astype(int)
@@ -292,7 +292,8 @@ def collect(design: FixedController, law: Controller, basis: str, n_modes: int) 
     """
     structure, case, pose = plant_structure(design, basis, n_modes), design.case, _home(design)
     case = case._replace(
-        initial=case.initial._replace(modal=np.zeros((3, n_modes))), n_modes=jnp.asarray(n_modes)
+        initial=case.initial._replace(modal=np.zeros((structure.n_links, n_modes))),
+        n_modes=jnp.asarray(n_modes),
     )
     law = jax.tree.map(jnp.asarray, law._replace(feedback=law.feedback.without_rivals()))
     return jax.tree.map(np.asarray, _modal_loop(structure, case, pose, law))
@@ -314,7 +315,9 @@ class SpectralRadius:
         self._law = jax.tree.map(jnp.asarray, law)
         self._structure = plant_structure(design, basis, LARGEST)
         self._case = design.case._replace(
-            initial=design.case.initial._replace(modal=np.zeros((3, LARGEST))),
+            initial=design.case.initial._replace(
+                modal=np.zeros((design.structure.n_links, LARGEST))
+            ),
             n_modes=jnp.asarray(LARGEST),
         )
         self._pose = _home(design)

@@ -151,7 +151,7 @@ def case_of(structure: Structure, numbers: Numbers) -> Case:
         drive=_drive(numbers, structure),
         load=Load(*(number(f"load.{name}") for name in Load._fields)),
         initial=Initial(
-            _fill(number("initial.modal"), (3, structure.n_modes), 0.0, xp),
+            _fill(number("initial.modal"), (structure.n_links, structure.n_modes), 0.0, xp),
             # on a link that is shorter it has no deflection
             xp.minimum(
                 number("initial.load_station"), 0.999 * xp.min(number("link.length"), axis=-1)
@@ -238,14 +238,14 @@ def _bridge(numbers: Numbers) -> Any:
 
 
 def _joint_angle(numbers: Numbers, xp: Any) -> Any:
-    """psi [rad], (..., 3): as given, otherwise those of the assembly."""
+    """psi [rad], (..., n): as given, otherwise those of the assembly."""
     of_assembly = xp.asarray(list(ASSEMBLIES.values()))[numbers["machine.assembly"]]
     angle = xp.radians(numbers["machine.joint_angles_deg"])
     return xp.where(xp.isnan(angle), of_assembly, angle) if angle.shape[-1] else of_assembly
 
 
 def _damping(numbers: Numbers, xp: Any) -> Damping:
-    ratio = numbers["link.damping_ratio"]  # (..., 3, n)
+    ratio = numbers["link.damping_ratio"]  # (..., n, m)
     count = xp.maximum(xp.sum(~xp.isnan(ratio), axis=-1), 1)
     last = xp.minimum(xp.arange(ratio.shape[-1]), count[..., None] - 1)
     exponent = xp.asarray([0.0, -1.0, 1.0])[numbers["link.damping_law"]]
@@ -253,7 +253,7 @@ def _damping(numbers: Numbers, xp: Any) -> Damping:
 
 
 def _path(numbers: Numbers, xp: Any) -> motion.Path:
-    points = numbers["motion.waypoints"]  # (..., M, 3), NaN beyond the last one
+    points = numbers["motion.waypoints"]  # (..., M, p), NaN beyond the last one
     count = xp.sum(~xp.isnan(points[..., 0]), axis=-1)
     moves = max(points.shape[-2] - 1, 1)  # a platform at rest moves to its own pose
     reached = xp.minimum(xp.arange(moves + 1), count[..., None] - 1)
@@ -288,7 +288,7 @@ def _shaping(numbers: Numbers, xp: Any) -> Shaping:
 
 
 def _control(numbers: Numbers, structure: Structure, xp: Any) -> Control:
-    shape = (3, structure.n_controlled)
+    shape = (structure.n_links, structure.n_controlled)
     number, law = numbers.__getitem__, LAWS[structure.law]
 
     def filled(field: str, fill: float) -> Any:
@@ -318,7 +318,7 @@ def _control(numbers: Numbers, structure: Structure, xp: Any) -> Control:
 
 
 def law_parameters(study: Study, law: Law) -> dict[str, np.ndarray]:
-    """A law's own fields in a study, whichever law the study selects, (3,) each."""
+    """A law's own fields in a study, whichever law the study selects, (n,) each."""
     fields = Fields(study)
     names = [x.name for x in law.parameters]
     return {name: fields.each_link(f"{OWN_LAWS}.{law.name}.{name}")[0] for name in names}

@@ -29,25 +29,22 @@ SAMPLE_LIMIT = 2_000_000
 SLOWEST_AMPLIFIER = 1.0
 
 
-def each_link(value: Any) -> np.ndarray:
-    """One number for all links, or three of them, as (3,)."""
-    return np.broadcast_to(np.asarray(value, float), (3,))
-
-
 def patch_pitch(study: Study) -> np.ndarray:
     """Length of one patch pair along each link, the longer of both patches [m], (3,)."""
     patches = study.patches
-    return np.maximum(each_link(patches.sensor_length), each_link(patches.actuator_length))
+    return np.maximum(
+        study.each_link(patches.sensor_length), study.each_link(patches.actuator_length)
+    )
 
 
 def patch_centers(study: Study) -> np.ndarray:
     """Patch centres of every link [m], (3, K)."""
     centers = study.patches.centers
     is_nested = len(centers) > 0 and isinstance(centers[0], tuple)
-    rows = centers if is_nested else (centers,) * 3
-    if len(rows) != 3 or len({len(row) for row in rows}) != 1 or not rows[0]:  # type: ignore[arg-type]
+    rows = centers if is_nested else (centers,) * study.n_links
+    if len({len(row) for row in rows}) != 1 or not rows[0]:  # type: ignore[arg-type]
         raise field_error(
-            "patches.centers", centers, "one list of centres, or three lists of equal length", "m"
+            "patches.centers", centers, "one list of centres, or one a link of equal length", "m"
         )
     return np.array(rows, float)
 
@@ -78,10 +75,7 @@ def check_consistency(study: Study) -> None:
     _check_own_fields("control.laws", control.laws, LAWS)
     _check_own_fields("drive.kinds", study.drive.kinds, DRIVES)
     _check_own_fields("machine.kinds", study.machine.kinds, MECHANISMS)
-    count = len(control.links)
-    if MECHANISMS[study.machine.kind].n_links != count:
-        allowed = [name for name, x in MECHANISMS.items() if x.n_links == count]
-        raise field_error("machine.kind", study.machine.kind, ", ".join(allowed))
+    _check_mechanism(study)
     _check_basis(study)
     _check_stations(study)
     _check_sampling(study)
@@ -89,12 +83,31 @@ def check_consistency(study: Study) -> None:
     _check_coupling(study)
 
 
+def _check_mechanism(study: Study) -> None:
+    """Reject fields that the study's mechanism does not read."""
+    mechanism, machine = MECHANISMS[study.machine.kind], study.machine
+    solid = {"platform_inertia"} if mechanism.n_pose == 3 else set()
+    read = {"kind", "kinds", "platform_mass", *solid, *mechanism.reads}
+    for leaf, info in type(machine).model_fields.items():
+        value, default = getattr(machine, leaf), info.default
+        if isinstance(default, tuple):
+            default = default[: mechanism.n_links]
+        if leaf not in read and value != default:
+            without = f"not given: machine.kind = {mechanism.name!r} has no such part"
+            raise field_error(f"machine.{leaf}", value, without)
+    if not solid:
+        for leaf in ("inertia", "offset"):
+            if np.any(getattr(study.load, leaf)):
+                value = getattr(study.load, leaf)
+                raise field_error(f"load.{leaf}", value, "0: the platform is a point")
+
+
 def _check_stations(study: Study) -> None:
     for value in study.metrics.stations:
         if not 0 < value < 1:
             allowed = "between 0 and 1, exclusive: fractions of each link's length"
             raise field_error("metrics.stations", value, allowed, "1")
-    shortest, load = each_link(study.link.length).min(), study.initial.load_station
+    shortest, load = study.each_link(study.link.length).min(), study.initial.load_station
     if any(study.initial.load_deflection) and not 0 < load < shortest:
         allowed = f"between 0 and link.length = {shortest:g}, exclusive"
         raise field_error("initial.load_station", load, allowed, "m")
@@ -131,14 +144,14 @@ def _check_poles(study: Study) -> None:
         if not _is_nested(value):
             continue
         lengths = [len(row) for row in value]  # type: ignore[union-attr,arg-type]
-        if len(lengths) != 3 or min(lengths) < 1 or max(lengths) > control.modes:
-            allowed = f"three lists of 1 to {control.modes} entries (control.modes)"
+        if min(lengths) < 1 or max(lengths) > control.modes:
+            allowed = f"one list a link of 1 to {control.modes} entries (control.modes)"
             raise field_error(name, value, allowed, unit)
     if control.modes > 1 and frequency != () and not _is_nested(frequency):
         raise field_error(
             "control.pole_frequency_hz",
             frequency,
-            "three lists, one a link by mode, where control.modes is more than 1: "
+            "one list a link by mode, where control.modes is more than 1: "
             "[[130.0], [120.0], [125.0]] moves mode 1 alone",
             "Hz",
         )
@@ -182,15 +195,19 @@ def _check_own_fields(
                 allowed = ", ".join(parameters) or "no field of its own"
                 raise field_error(f"{path}.{leaf}", value, allowed, hint=nearest(leaf, parameters))
             low, high, unit = parameters[leaf].low, parameters[leaf].high, parameters[leaf].unit
-            if not np.all((each_link(value) >= low) & (each_link(value) <= high)):
+            if not np.all((np.asarray(value) >= low) & (np.asarray(value) <= high)):
                 raise field_error(f"{path}.{leaf}", value, f"{low:g} to {high:g}", unit)
 
 
 def _check_patches(study: Study) -> None:
     """Reject patches that leave their link, or overlap."""
     patches, link = study.patches, study.link
-    pitches, lengths, is_own = patch_pitch(study), each_link(link.length), _differs(link.length)
-    sensor = each_link(patches.sensor_length)
+    pitches, lengths, is_own = (
+        patch_pitch(study),
+        study.each_link(link.length),
+        _differs(link.length),
+    )
+    sensor = study.each_link(patches.sensor_length)
     for i, (row, pitch, length) in enumerate(
         zip(patch_centers(study), pitches, lengths, strict=True)
     ):
@@ -225,15 +242,18 @@ def _check_patches(study: Study) -> None:
         raise field_error(
             "patches.hysteresis", patches.hysteresis, "0 where control.feedback = 'ideal'", "1"
         )
-    widths = each_link(patches.width)
-    for i in np.flatnonzero(widths > each_link(link.width) * (1 + 1e-9))[:1]:
+    widths = study.each_link(patches.width)
+    for i in np.flatnonzero(widths > study.each_link(link.width) * (1 + 1e-9))[:1]:
         raise field_error(
-            "patches.width", widths[i], f"at most link.width = {each_link(link.width)[i]:g}", "m"
+            "patches.width",
+            widths[i],
+            f"at most link.width = {study.each_link(link.width)[i]:g}",
+            "m",
         )
 
 
 def _differs(value: Any) -> bool:
-    return bool(np.ptp(each_link(value)) > 0)
+    return bool(np.ptp(value) > 0)
 
 
 def check_locked(study: Study) -> None:
@@ -254,9 +274,9 @@ def check_locked(study: Study) -> None:
 def _check_coupling(study: Study) -> None:
     """The ceramic must couple, but not completely: k31^2 = d31^2 E_p/eps33T in (0, 1)."""
     patches = study.patches
-    permittivity = each_link(patches.relative_permittivity) * VACUUM_PERMITTIVITY
-    highest = np.sqrt(permittivity / each_link(patches.youngs_modulus))
-    size = np.abs(each_link(patches.d31))
+    permittivity = study.each_link(patches.relative_permittivity) * VACUUM_PERMITTIVITY
+    highest = np.sqrt(permittivity / study.each_link(patches.youngs_modulus))
+    size = np.abs(study.each_link(patches.d31))
     for i in np.flatnonzero((size <= 1e-6 * highest) | (size >= highest))[:1]:
         raise field_error(
             "patches.d31",
@@ -323,7 +343,7 @@ def _check_sampling(study: Study) -> None:
 
 
 def _nested(lists: Any) -> tuple[Any, ...]:
-    """A table of three lists; empty if one number or list serves all links."""
+    """A table of lists, one a link; empty if one number or list serves all links."""
     return lists if isinstance(lists, tuple) and lists and isinstance(lists[0], tuple) else ()
 
 
@@ -373,9 +393,6 @@ def _check_lists(study: Study) -> None:
     ):
         if isinstance(flat, tuple) and not _nested(flat) and len(flat) > limit:
             raise field_error(name, flat, f"at most {most} = {limit} entries", unit)
-    for name, table, _width, unit in tables:
-        if table and len(table) != 3:
-            raise field_error(name, table, "three lists, one per link", unit)
     for name, table, width, unit in tables[1:]:
         if any(len(row) > width for row in table):
             raise field_error(name, table, f"at most {width} entries per link", unit)

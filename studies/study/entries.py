@@ -6,16 +6,16 @@ from 0. A whole metric is taken over the links that count: the controlled ones.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxmodel.case import Structure
-from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.metrics import METRICS, Sizes
 from studies.errors import StudyError, nearest
-from studies.study.paths import LINKS, NAMED_INDEX, parse_entry
+from studies.study.paths import NAMED_INDEX, parse_entry
 from studies.study.spec import Study
 
 
@@ -61,7 +61,7 @@ def parse_entries(name: str, path: str = "", sizes: Mapping[str, int] | None = N
     Args:
         name: of a metric, perhaps with indices.
         path: where it is written, for messages.
-        sizes: of axes, for checking indices; those not given have three entries.
+        sizes: of axes, for checking indices; None: they are not checked.
 
     Raises:
         StudyError: no such metric, axis or entry.
@@ -73,7 +73,7 @@ def parse_entries(name: str, path: str = "", sizes: Mapping[str, int] | None = N
         suggestion = f"did you mean {hint!r}?" if hint else f"allowed: {', '.join(METRICS)}"
         raise StudyError(f"{where}{name!r}: unknown metric; {suggestion}")
     axes = METRICS[plain.field].dims
-    size = {axis: (sizes or {}).get(axis, 3) for axis in axes}
+    size = {axis: sizes[axis] if sizes else sys.maxsize for axis in axes}
     at: dict[str, int] = {}
     for axis, written in NAMED_INDEX.findall(name):
         if axis not in axes or axis in at or not 1 <= int(written) <= size[axis]:
@@ -96,14 +96,15 @@ def entry_sizes(study: Study) -> dict[str, int]:
         n_modes=study.link.modes,
         n_controlled=study.control.modes,
         n_frequencies=Structure().n_frequencies,
-        n_links=MECHANISMS[study.machine.kind].n_links,
-        n_pose=MECHANISMS[study.machine.kind].n_pose,
+        n_links=study.n_links,
+        n_pose=study.n_pose,
     )
     return sizes.axes
 
 
 def controlled_links(studies: Iterable[Study]) -> tuple[int, ...]:
     """Links that any of these studies controls, from 0; all if none does."""
+    studies = list(studies)
     links = {
         k
         for study in studies
@@ -111,12 +112,12 @@ def controlled_links(studies: Iterable[Study]) -> tuple[int, ...]:
         for k, is_on in enumerate(study.control.links)
         if is_on
     }
-    return tuple(sorted(links)) or tuple(range(LINKS))
+    return tuple(sorted(links)) or tuple(range(studies[0].n_links))
 
 
-def links_text(links: tuple[int, ...]) -> str:
-    """Counted links in words: "link 1", "links 1 and 3", "all links"."""
+def links_text(links: tuple[int, ...], n_links: int) -> str:
+    """Counted links of so many in words: "link 1", "links 1 and 3", "all links"."""
     names = [str(k + 1) for k in links]
-    if len(names) == LINKS:
+    if len(names) == n_links:
         return "all links"
     return f"link{'s' if len(names) > 1 else ''} {' and '.join(names)}"

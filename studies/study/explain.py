@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -11,6 +11,7 @@ from pydantic.fields import FieldInfo
 
 from studies.errors import StudyError, field_error, nearest, shown, shown_name
 from studies.study.choices import OneOf
+from studies.study.sizes import OneEach, depth
 
 _SIGNS = (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="))
 _WORDS = {bool: "true or false", str: "text", float: "a finite number", int: "a whole number"}
@@ -34,10 +35,13 @@ def choices_of(annotation: Any, metadata: Iterable[Any] = ()) -> tuple[Any, ...]
     return tables[0] if tables else literal
 
 
-def allowed_values(annotation: Any, metadata: Iterable[Any] = ()) -> str:
+def allowed_values(
+    annotation: Any, metadata: Iterable[Any] = (), sizes: Mapping[str, int] | None = None
+) -> str:
     """What a type with its limits allows: "a number > 0 and <= 100", "'a' or 'b'", "3 numbers".
 
     annotation: the type of a field or of an entry. metadata: its limits, as pydantic keeps them.
+    sizes: lengths of lists with one entry for each of something, if they are known.
     """
     names = choices_of(annotation, metadata)
     if names:
@@ -49,26 +53,38 @@ def allowed_values(annotation: Any, metadata: Iterable[Any] = ()) -> str:
             return str(item.allowed)
     origin, arguments = get_origin(annotation), get_args(annotation)
     if hasattr(annotation, "__metadata__"):
-        return allowed_values(arguments[0], _limits(annotation))
+        return allowed_values(arguments[0], _limits(annotation), sizes)
     if origin in (Union, UnionType):
         arguments = tuple(x for x in arguments if x is not type(None))  # left out
         if len(arguments) == 1:
-            return allowed_values(arguments[0], metadata)
-        several = get_args(arguments[-1])
-        if several == arguments[:1] * len(several):  # one number, or some of the same kind
+            return allowed_values(arguments[0], metadata, sizes)
+        mark = _mark(_limits(arguments[-1]))
+        is_number = depth(arguments[0]) == 0
+        if mark and is_number and get_args(arguments[-1])[0] == tuple[arguments[0], ...]:  # type: ignore[valid-type]
             inner, limits = get_args(arguments[0])[0], _range(_limits(arguments[0]))
-            return f"{_WORDS[inner]}, or a list of {len(several)}, each {limits}"
-        return ", or ".join(allowed_values(each, metadata) for each in arguments)
+            return f"{_WORDS[inner]}, or a list of {_count(mark, sizes)}, each {limits}"
+        return ", or ".join(allowed_values(each, metadata, sizes) for each in arguments)
     if origin is dict:
         return f"a table{' of one entry or more' if _bound(metadata, 'min_length') else ''}"
     if origin is tuple:
-        return _entries(arguments, metadata)
+        return _entries(arguments, metadata, sizes)
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return f"a section with fields {', '.join(annotation.model_fields)}"
     return " ".join(filter(None, (_WORDS[annotation], _range(metadata))))
 
 
-def _entries(arguments: tuple[Any, ...], metadata: Iterable[Any]) -> str:
+def _mark(metadata: Iterable[Any]) -> OneEach | None:
+    return next((item for item in metadata if isinstance(item, OneEach)), None)
+
+
+def _count(mark: OneEach, sizes: Mapping[str, int] | None) -> str:
+    """How many entries, in words: "3", or "one per link"."""
+    return str(sizes[mark.of]) if sizes else f"one per {mark.of}"
+
+
+def _entries(
+    arguments: tuple[Any, ...], metadata: Iterable[Any], sizes: Mapping[str, int] | None
+) -> str:
     """A list: how many entries, and of what."""
     if not arguments:
         return "an empty list"
@@ -76,16 +92,20 @@ def _entries(arguments: tuple[Any, ...], metadata: Iterable[Any]) -> str:
     inner = get_args(entry)[0] if hasattr(entry, "__metadata__") else entry
     inner = dict if get_origin(inner) is dict else inner
     least, most = _bound(metadata, "min_length"), _bound(metadata, "max_length")
-    if arguments[-1] is not Ellipsis:
+    mark = _mark(metadata)
+    if mark:
+        count = f"{_count(mark, sizes)} " if sizes else f"{_count(mark, sizes)}, "
+    elif arguments[-1] is not Ellipsis:
         count = f"{len(arguments)} "
     elif most is not None:
         count = f"{least or 0} to {most} "
     else:
         count = f"{least} or more " if least else "a list of "
     if get_origin(inner) is tuple:
-        return f"{count}lists, each of {_entries(get_args(inner), ()).removeprefix('a list of ')}"
+        own = _entries(get_args(inner), _limits(entry), sizes).removeprefix("a list of ")
+        return f"{count}lists, each of {own}"
     if get_origin(inner) is Literal:
-        return count + allowed_values(inner, ())
+        return count + allowed_values(inner, (), sizes)
     limits = _range(_limits(entry))
     return f"{count}{_PLURALS[inner]}" + (f", each {limits}" if limits else "")
 
@@ -118,12 +138,17 @@ def _range(metadata: Iterable[Any]) -> str:
 
 
 def explain(
-    error: ValidationError, study: type[BaseModel], data: dict[str, Any], inside: str = ""
+    error: ValidationError,
+    study: type[BaseModel],
+    data: dict[str, Any],
+    inside: str = "",
+    sizes: Mapping[str, int] | None = None,
 ) -> StudyError:
     """The first fault that pydantic found, in the words of the study file.
 
     error: what validation raised. study: the outermost model. data: what was validated.
     inside: name of the section that the model describes, "" for a whole study.
+    sizes: see `allowed_values`.
     """
     fault = error.errors(include_url=False)[0]
     location = list(fault["loc"])
@@ -137,9 +162,9 @@ def explain(
             break
         model = inner
     if info is None:
-        return field_error(inside or "study", fault["input"], allowed_values(study))
+        return field_error(inside or "study", fault["input"], allowed_values(study, (), sizes))
     is_missing = fault["type"] == "missing"
-    return _bad_value(info, location[:used], location[used:], is_missing, data, inside)
+    return _bad_value(info, location[:used], location[used:], is_missing, data, inside, sizes)
 
 
 def _unknown(
@@ -167,11 +192,13 @@ def _bad_value(
     is_missing: bool,
     data: dict[str, Any],
     inside: str,
+    sizes: Mapping[str, int] | None,
 ) -> StudyError:
     annotation, metadata = info.annotation, list(info.metadata)
     if is_missing and not entries:
         unit = unit_of(info)
-        text = f"{_dotted(inside, name)}: missing; allowed: {allowed_values(annotation, metadata)}"
+        allowed = allowed_values(annotation, metadata, sizes)
+        text = f"{_dotted(inside, name)}: missing; allowed: {allowed}"
         return StudyError(f"{text} [{unit}]" if unit else text)
     value: Any = data
     for part in name:
@@ -187,10 +214,12 @@ def _bad_value(
         arguments = get_args(annotation)
         annotation = arguments[0] if arguments[-1] is Ellipsis else arguments[part]
         metadata, value = [], value[part]
+        if hasattr(annotation, "__metadata__"):
+            annotation, metadata = get_args(annotation)[0], _limits(annotation)
         name = [*name, part]
     choices = choices_of(annotation, metadata)
     hint = nearest(value, choices) if isinstance(value, str) else ""
-    allowed = allowed_values(annotation, metadata)
+    allowed = allowed_values(annotation, metadata, sizes)
     return field_error(_dotted(inside, name), value, allowed, unit_of(info), hint)
 
 

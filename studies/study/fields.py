@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from studies.study.paths import LINKS, field_value, parse_entry
+from studies.study.paths import field_value, parse_entry
 from studies.study.spec import Study
 
 Columns = Mapping[str, np.ndarray]
 
 
-def padded(values: list[Any]) -> np.ndarray:
+def padded(values: list[Any], n_links: int) -> np.ndarray:
     """Numbers, or lists of any length, as one float array with NaN for missing entries.
 
     Beside lists, one number stands for all links.
@@ -26,7 +26,7 @@ def padded(values: list[Any]) -> np.ndarray:
     is_list = [isinstance(value, (tuple, list, np.ndarray)) for value in values]
     if not any(is_list):
         return np.array(values, float)
-    values = [x if is_it else (x,) * LINKS for x, is_it in zip(values, is_list, strict=True)]
+    values = [x if is_it else (x,) * n_links for x, is_it in zip(values, is_list, strict=True)]
     if all(np.size(np.array(value, object)) == 0 for value in values):
         return np.zeros((len(values), 0))
     depth = nesting(values)
@@ -91,7 +91,7 @@ class Fields:
     def numbers(self, field: str) -> np.ndarray:
         """As floats, with entries of lists filled in; NaN pads ragged lists."""
         raw = self.raw(field)
-        array = padded(list(raw)) if raw.dtype == object else raw.astype(float)
+        array = padded(list(raw), self.study.n_links) if raw.dtype == object else raw.astype(float)
         return self._with_entries(field, array)
 
     def spread(self, field: str, shape: tuple[int, ...], missing: float = 0.0) -> np.ndarray:
@@ -108,16 +108,16 @@ class Fields:
             entry = parse_entry(name)
             if entry is not None and entry.field == field and entry.indices:
                 if array.ndim == 1:
-                    array = np.repeat(array[:, None], LINKS, axis=1)
+                    array = np.repeat(array[:, None], self.study.n_links, axis=1)
                 if len(array) != len(column):
                     array = np.repeat(array, len(column), axis=0)
                 np.moveaxis(array, 0, -1)[entry.indices] = np.moveaxis(column, 0, -1)
         return array
 
     def each_link(self, field: str) -> np.ndarray:
-        """As floats, one for each link even if one stands for all, (m, 3)."""
+        """As floats, one for each link even if one stands for all, (m, n)."""
         array = self.numbers(field)
-        return np.repeat(array[:, None], LINKS, axis=1) if array.ndim == 1 else array
+        return np.repeat(array[:, None], self.study.n_links, axis=1) if array.ndim == 1 else array
 
     def choices(self, field: str, names: tuple[str, ...]) -> np.ndarray:
         """Index of each text value in `names`, (m,)."""

@@ -9,7 +9,6 @@ import numpy as np
 
 from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES
-from studies.study.consistency import each_link
 from studies.study.paths import field_value, own_fields
 from studies.study.spec import OWN_MECHANISMS, Study
 
@@ -22,7 +21,7 @@ def build_geometry(
     Args:
         kind: name of the mechanism.
         number: value of a field in its unit.
-        joint_angle: of the platform's joints in its own axes [rad], (..., 3).
+        joint_angle: of the platform's joints in its own axes [rad], (..., n).
         xp: NumPy or `jax.numpy`.
     """
     mechanism = MECHANISMS[kind]
@@ -48,14 +47,28 @@ def machine_geometry(study: Study) -> tuple[Any, np.ndarray]:
 
     def number(name: str) -> Any:
         value = field_value(study, name)
-        return value if name == "machine.guide_side" else each_link(value)
+        return value if name == "machine.guide_side" else study.each_link(value)
 
     geometry, near_mass = build_geometry(machine.kind, number, angle, np)
     return geometry, np.asarray(near_mass)
 
 
-def far_arms(geometry: Any, phi: float) -> np.ndarray:
-    """Platform joints C from the reference point in the plane [m], (n, 2); phi [rad]."""
-    x, y = geometry.arms(np)
-    sine, cosine = np.sin(phi), np.cos(phi)
-    return np.stack([x * cosine - y * sine, y * cosine + x * sine], axis=1)
+def far_joints(geometry: Any, pose: Any, n_links: int) -> tuple[np.ndarray, np.ndarray]:
+    """Far joints C at a pose.
+
+    Args:
+        geometry: the mechanism's.
+        pose: (x, y, phi) or (x, y) [m, m, rad], (p,).
+        n_links: n.
+
+    Returns:
+        C [m], (n, 2); its derivatives by the pose [1, 1, m], (n, 2, p).
+    """
+    place, turn = np.asarray(pose[:2], float), np.asarray(pose[2:], float)
+    arms, plane = geometry.arms(np), np.tile(np.eye(2), (n_links, 1, 1))
+    if arms is None:
+        return np.tile(place, (n_links, 1)), plane
+    (x, y), sine, cosine = arms, np.sin(turn[0]), np.cos(turn[0])
+    arm = np.stack([x * cosine - y * sine, y * cosine + x * sine], axis=1)
+    turned = np.stack([-arm[:, 1], arm[:, 0]], axis=1)
+    return place + arm, np.concatenate([plane, turned[:, :, None]], axis=2)

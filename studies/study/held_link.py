@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from studies.study.consistency import each_link, patch_centers
+from studies.study.consistency import patch_centers
 
 if TYPE_CHECKING:
     from studies.study.spec import Study
@@ -24,15 +24,17 @@ _POINTS, _ITERATIONS = 4001, 4
 
 
 def first_frequency(study: Study, with_patches: bool) -> np.ndarray:
-    """Frequency of mode 1 of each link between held ends [Hz], (3,).
+    """Frequency of mode 1 of each link between held ends [Hz], (n,).
 
     Args:
         study: links and patches.
         with_patches: the patches' mass and stiffness and the joints' rotary inertia count.
     """
-    joints = [each_link(getattr(study.link, f"joint_inertia_{end}")) for end in "bc"]
+    joints = [study.each_link(getattr(study.link, f"joint_inertia_{end}")) for end in "bc"]
     inertia = np.stack(joints, axis=1) * with_patches
-    return np.array([_stodola(*_line(study, i, with_patches), inertia[i]) for i in range(3)])
+    return np.array(
+        [_stodola(*_line(study, i, with_patches), inertia[i]) for i in range(study.n_links)]
+    )
 
 
 def laminate_stiffness(
@@ -58,7 +60,7 @@ def _line(study: Study, i: int, with_patches: bool) -> tuple[np.ndarray, np.ndar
     """Points along link i [m], its mass per length there [kg/m] and stiffness E I [N m2]."""
 
     def of(section: object, name: str) -> float:
-        return float(each_link(getattr(section, name))[i])
+        return float(study.each_link(getattr(section, name))[i])
 
     link, patches = study.link, study.patches
     x = np.linspace(0, of(link, "length"), _POINTS)

@@ -2,7 +2,7 @@
 
 They are one dictionary: the name of each field, as in the file and in its unit, with an array of a
 shape that the schema decides. Lists of unequal length are padded with NaN, a number that stands for
-all links is there three times, choices are positions among their names, truth values are 1 or 0.
+all links is there once for each, choices are positions among their names, truth values are 1 or 0.
 `studies.study.cases.case_of` turns them into the arrays of the model.
 """
 
@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cache
 from types import EllipsisType
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -23,15 +23,16 @@ from jaxmodel.laws import LAWS
 from jaxmodel.laws.state_space import STATE_SPACE
 from jaxmodel.mechanisms import MECHANISMS
 from studies.study.fields import Columns, Fields, nesting
-from studies.study.paths import LINKS, all_fields, field_choices, own_fields, own_place, parse_entry
+from studies.study.paths import all_fields, field_choices, own_fields, own_place, parse_entry
+from studies.study.sizes import alternatives, depth, has_one_a_link
 from studies.study.spec import OWN_DRIVES, OWN_LAWS, OWN_MECHANISMS, Study
 from studies.study.state_space import system_of
 from studies.study.window import DELAY, residual_delay
 
 Numbers = dict[str, Any]
 #: How a field's array looks, without the axis of cases: () for a number or (n, ...) for a list;
-#: one entry a link, (3,); a list a link, (3, n); one entry for each controlled mode of each link,
-#: (3, C); a position among names; one entry a move, (n,), n = 1 if one stands for all.
+#: one entry a link, (l,); a list a link, (l, n); one entry for each controlled mode of each link,
+#: (l, C); a position among names; one entry a move, (n,), n = 1 if one stands for all.
 Form = Literal["plain", "integer", "choice", "link", "list of links", "mode", "move"]
 #: Its number, or one a link, is that of mode 1; those of other fields are the same for all modes.
 OF_MODE_1 = "control.damping"
@@ -44,30 +45,23 @@ def form_of(field: str) -> Form:
         return "link"
     if field_choices(field):
         return "choice"
-    alternatives = _alternatives(field)
-    if alternatives == (int,):
+    annotation = _annotation(field)
+    if annotation is int:
         return "integer"
-    depths = set(map(_depth, alternatives))
-    has_triple = any(len(set(get_args(x))) == 1 and len(get_args(x)) == LINKS for x in alternatives)
+    depths = set(map(depth, alternatives(annotation)))
+    is_by_link = has_one_a_link(annotation)
     if {1, 2} <= depths:
-        return "mode" if has_triple else "list of links"
+        return "mode" if is_by_link else "list of links"
     if {0, 1} <= depths:
-        return "link" if has_triple else "move"
+        return "link" if is_by_link else "move"
     return "plain"
 
 
-def _alternatives(field: str) -> tuple[Any, ...]:
-    """Types that a field can have, without the empty list."""
+def _annotation(field: str) -> Any:
+    """Type of a field in the schema."""
     section, _, leaf = field.partition(".")
     model: Any = Study.model_fields[section].annotation
-    annotation = model.model_fields[leaf].annotation
-    is_one = get_origin(annotation) in (None, tuple)
-    return tuple(x for x in ((annotation,) if is_one else get_args(annotation)) if x != tuple[()])
-
-
-def _depth(annotation: Any) -> int:
-    """Levels of lists."""
-    return 1 + _depth(get_args(annotation)[0]) if get_origin(annotation) is tuple else 0
+    return model.model_fields[leaf].annotation
 
 
 def study_numbers(study: Study, structure: Structure, columns: Columns | None = None) -> Numbers:
@@ -98,7 +92,7 @@ def study_numbers(study: Study, structure: Structure, columns: Columns | None = 
     is_given = DELAY in fields.columns
     numbers[DELAY] = fields.numbers(DELAY) if is_given else np.array([residual_delay(study)])
     if structure.law == STATE_SPACE.name:
-        system = system_of(study.state_space, structure.n_patches)
+        system = system_of(study.state_space, structure.n_links, structure.n_patches)
         numbers["state_space"] = jax.tree.map(lambda x: np.asarray(x)[None], system)
     return numbers
 
@@ -134,17 +128,17 @@ def _array(fields: Fields, field: str, structure: Structure) -> np.ndarray:
     if form == "integer":
         return fields.raw(field).astype(int)
     if form == "mode":
-        return _by_mode(fields, field, (LINKS, structure.n_controlled))
+        return _by_mode(fields, field, (structure.n_links, structure.n_controlled))
     if form == "link":
         return fields.each_link(field)
     array = fields.numbers(field)
     if form == "plain":  # lists of lists keep their axes where there is none
-        missing = max(map(_depth, _alternatives(field))) + 1 - array.ndim
+        missing = max(map(depth, alternatives(_annotation(field)))) + 1 - array.ndim
         return array.reshape(*array.shape, *[0] * missing)
     if array.ndim == 1:
         array = array[:, None]
     is_for_all = form == "list of links" and array.ndim == 2
-    return np.repeat(array[:, None], LINKS, axis=1) if is_for_all else array
+    return np.repeat(array[:, None], structure.n_links, axis=1) if is_for_all else array
 
 
 def _by_mode(fields: Fields, field: str, shape: tuple[int, int]) -> np.ndarray:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from operator import attrgetter
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ValidationError
 
@@ -24,10 +24,18 @@ from jaxmodel.mechanisms.prrr import PRRR
 from jaxmodel.table import Parameter
 from studies.errors import StudyError, nearest, shown
 from studies.study.consistency import check_consistency
-from studies.study.explain import choices_of, explain, unit_of
-from studies.study.spec import OWN_DRIVES, OWN_FIELDS, OWN_LAWS, OWN_MECHANISMS, Study
+from studies.study.explain import choices_of, unit_of
+from studies.study.sizes import alternatives, depth, for_mechanism, has_one_a_link
+from studies.study.spec import (
+    OWN_DRIVES,
+    OWN_FIELDS,
+    OWN_LAWS,
+    OWN_MECHANISMS,
+    Study,
+    explained,
+    validate,
+)
 
-LINKS = 3
 #: An index that names its axis and counts from 1, as in the files: `residual_rms[link=1]`.
 NAMED_INDEX = re.compile(r"\[(\w+)=(\d{1,6})\]")
 _ENTRY = re.compile(r"(?P<field>[^\s\[\]]+)(?P<indices>(\[(0|[1-9]\d{0,5})\])*)")
@@ -125,7 +133,7 @@ def own_parameter(field: str) -> Parameter | None:
 
 
 def is_each_link(field: str) -> bool:
-    """Whether a field takes one number for all links, or three."""
+    """Whether a field takes one number for all links, or one each."""
     return field in EACH_LINK or bool(own_place(field))
 
 
@@ -174,9 +182,9 @@ def free_fields(parts: Iterable[Parts], *roles: str) -> tuple[str, ...]:
     return (*names, *own, *own_fields(OWN_MECHANISMS, [MECHANISMS[name] for name in mechanisms]))
 
 
-def as_list(field: str, value: Any) -> Any:
-    """A field's value as a list of entries: three if one number stands for all links."""
-    return (value,) * LINKS if is_each_link(field) and not isinstance(value, tuple) else value
+def as_list(field: str, value: Any, n_links: int) -> Any:
+    """A field's value as a list of entries: one a link if one number stands for all links."""
+    return (value,) * n_links if is_each_link(field) and not isinstance(value, tuple) else value
 
 
 def known_field(name: str, study: Study, path: str = "", others: Iterable[str] = ()) -> Any:
@@ -200,7 +208,7 @@ def known_field(name: str, study: Study, path: str = "", others: Iterable[str] =
         hint = f"did you mean {close!r}?" if close else "see studies init --all for all fields"
         raise StudyError(f"{where}{shown(name)}: unknown field; {hint}")
     value = field_value(study, entry.field)
-    value = as_list(entry.field, value) if entry.indices else value
+    value = as_list(entry.field, value, study.n_links) if entry.indices else value
     for index in entry.indices:
         if not isinstance(value, tuple) or index >= len(value):
             size = f"0 to {len(value) - 1}" if isinstance(value, tuple) and value else "none"
@@ -234,9 +242,9 @@ def set_values(study: Study, values: Mapping[str, Any]) -> dict[str, Any]:
             target = target.setdefault(section, {})
         if entry.indices:
             whole = target[leaf] if leaf in target else field_value(study, entry.field)
-            value = replaced(as_list(entry.field, whole), entry.indices, value)
+            value = replaced(as_list(entry.field, whole, study.n_links), entry.indices, value)
         target[leaf] = value
-    return data
+    return for_mechanism(data, Study, study.machine.kind, data["machine"]["kind"])
 
 
 def replaced(whole: Any, indices: tuple[int, ...], value: Any) -> Any:
@@ -255,11 +263,11 @@ def checked_value(study: Study, name: str, value: Any, path: str) -> Any:
     """
     data = set_value(study, name, as_tuples(value))
     try:
-        changed = Study.model_validate(data)
+        changed = validate(data)
         if not name.startswith(JUDGED_BY_STATUS):
             check_consistency(changed)
     except ValidationError as error:
-        raise StudyError(f"{path}: {explain(error, Study, data)}") from None
+        raise StudyError(f"{path}: {explained(error, data)}") from None
     except StudyError as error:
         raise StudyError(f"{path}: {error}") from None
     return known_field(name, changed)
@@ -282,8 +290,8 @@ def _each_link_fields() -> frozenset[str]:
     fields = set()
     for section, outer in Study.model_fields.items():
         for leaf, info in getattr(outer.annotation, "model_fields", {}).items():
-            one, *others = get_args(info.annotation) or (None,)
-            if (one,) * LINKS in [get_args(other) for other in others]:
+            depths = map(depth, alternatives(info.annotation))
+            if 0 in depths and has_one_a_link(info.annotation):
                 fields.add(f"{section}.{leaf}")
     return frozenset(fields)
 

@@ -59,7 +59,7 @@ def parse_signal(
         text: as the file writes it.
         kinds: INPUTS or OUTPUTS.
         n_patches: pairs of patches on each link.
-        length: of the links [m], (3,).
+        length: of the links [m], (n,).
         path: where it is written, for messages.
 
     Raises:
@@ -72,8 +72,8 @@ def parse_signal(
     if match is None or match[1] not in kinds or match[1] == "platform":
         raise field_error(path, text, allowed)
     kind, link = match[1], int(match[2])
-    if link > 3:
-        raise field_error(path, text, "links 1 to 3")
+    if link > len(length):
+        raise field_error(path, text, f"links 1 to {len(length)}")
     if (kind in ("actuator", "sensor")) != (match[3] is not None):
         raise field_error(path, text, kinds[kind][0])
     patch = int(match[3] or 1)

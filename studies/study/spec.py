@@ -22,7 +22,7 @@ from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law
 from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.mechanisms.contract import Mechanism
-from jaxmodel.mechanisms.prrr.paper import HOME
+from jaxmodel.mechanisms.prrr import PRRR
 from jaxmodel.motion import PROFILES
 from jaxmodel.shaper import SHAPERS
 from jaxmodel.table import Table
@@ -31,6 +31,15 @@ from studies.study.choices import OWN, OneOf
 from studies.study.consistency import check_consistency
 from studies.study.explain import explain
 from studies.study.files import READY, read_toml
+from studies.study.sizes import (
+    COORDINATE,
+    LINK,
+    default_path,
+    for_mechanism,
+    lengths,
+    mechanism_of,
+    with_own_defaults,
+)
 from studies.study.state_space import with_matrices
 
 #: Where the own fields of control laws, drives and mechanisms are, `PLACE.NAME.FIELD`.
@@ -49,7 +58,8 @@ AUTO = "auto"
 Coordinate = Annotated[float, Field(ge=-10, le=10)]
 Deflection = Annotated[float, Field(ge=-0.1, le=0.1)]
 Force = Annotated[float, Field(ge=-1e4, le=1e4)]
-Wrench = tuple[Force, Force, Force]
+Pose = Annotated[tuple[Coordinate, ...], COORDINATE]
+Wrench = Annotated[tuple[Force, ...], COORDINATE]
 Gain = Annotated[float, Field(ge=-1e9, le=1e9)]
 NotchHertz = Annotated[float, Field(ge=0, le=1e5)]
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -60,15 +70,18 @@ Time = Annotated[float, Field(ge=1e-4, le=100)]
 Pause = Annotated[float, Field(ge=0, le=100)]
 Degrees = Annotated[float, Field(ge=-360, le=360)]
 Offset = Annotated[float, Field(ge=-1, le=1)]
-Flags = tuple[bool, bool, bool]
 Matrix = tuple[tuple[float, ...], ...]
 Decay = Annotated[float, Field(gt=0, le=1e6)]
 OwnOrHertz = Annotated[float, Field(ge=0, le=1e5)]
 Number = TypeVar("Number")
+#: One for each link.
+OneALink: TypeAlias = Annotated[tuple[Number, ...], LINK]
 #: One number for all links, or one for each.
-EachLink: TypeAlias = Number | tuple[Number, Number, Number]
-#: The same, or one list a link by mode; empty: none given.
-EachMode: TypeAlias = EachLink[Number] | tuple[()] | tuple[tuple[Number, ...], ...]
+EachLink: TypeAlias = Number | OneALink[Number]
+#: One list a link, by mode or patch.
+ListALink: TypeAlias = Annotated[tuple[tuple[Number, ...], ...], LINK]
+#: One number for all links, one for each, or one list a link by mode; empty: none given.
+EachMode: TypeAlias = EachLink[Number] | tuple[()] | ListALink[Number]
 
 
 class OwnFields:
@@ -131,7 +144,7 @@ class MachineSection(Section):
     guide_side: float = described(
         0.6, "m", "side of the guide triangle", ge=0.01, le=10, free=MACHINE
     )
-    guide_angles_deg: tuple[Degrees, Degrees, Degrees] = described(
+    guide_angles_deg: OneALink[Degrees] = described(
         (120.0, 240.0, 0.0), "deg", "direction alpha of each guide; the platform is on its left"
     )
     guide_offsets: EachLink[Annotated[float, Field(ge=-10, le=10)]] = described(
@@ -140,7 +153,7 @@ class MachineSection(Section):
     assembly: Literal["inward", "outward"] = described(
         "inward", "-", "which of the paper's two assemblies: joints at 90, 210, 330 deg or opposite"
     )
-    joint_angles_deg: tuple[()] | tuple[Degrees, Degrees, Degrees] = described(
+    joint_angles_deg: tuple[()] | OneALink[Degrees] = described(
         (), "deg", "of the platform's joints in its own axes; empty: according to assembly"
     )
     joint_radius: EachLink[Annotated[float, Field(ge=1e-4, le=5)]] = described(
@@ -159,7 +172,7 @@ class MachineSection(Section):
 
 
 class LinkSection(Section):
-    """The three flexible links; dimensions and material: one number for all, or three."""
+    """The flexible links; dimensions and material: one number for all, or one each."""
 
     basis: Basis = described("pinned_pinned", "-", "modal basis of the plant")
     modes: int = described(8, "1", "plant modes per link", ge=1, le=16)
@@ -200,10 +213,10 @@ class LinkSection(Section):
         "model mismatch: true over nominal bending stiffness, which controller and shaper assume",
         free=MACHINE,
     )
-    damping_ratio: Zeta | tuple[Zeta, ...] | tuple[tuple[Zeta, ...], ...] = described(
+    damping_ratio: Zeta | tuple[Zeta, ...] | ListALink[Zeta] = described(
         0.01,
         "1",
-        "of mode 1; or by mode, for example measured: one list for all links, or three",
+        "of mode 1; or by mode, for example measured: one list for all links, or one each",
         free=MACHINE,
     )
     damping_law: Literal["constant", "mass", "stiffness"] = described(
@@ -228,10 +241,10 @@ class LinkSection(Section):
 class PatchesSection(Section):
     """Pairs of sensor and piezo actuator, which share a centre on opposite faces of a link."""
 
-    centers: tuple[float, ...] | tuple[tuple[float, ...], ...] = described(
+    centers: tuple[float, ...] | ListALink[float] = described(
         (0.05, 0.10, 0.15),
         "m",
-        "centres along the link; one list for all links, or three lists",
+        "centres along the link; one list for all links, or one each",
         free=DESIGN,
     )
     sensor_length: EachLink[Annotated[float, Field(ge=1e-5, le=1)]] = described(
@@ -282,16 +295,10 @@ class PatchesSection(Section):
 class MotionSection(Section):
     """The platform's path: point-to-point moves."""
 
-    waypoints: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = described(
-        (
-            (0.0, 0.0, HOME[2]),
-            (0.0, 0.01, HOME[2]),
-            (0.01, 0.01, HOME[2]),
-            (0.01, 0.0, HOME[2]),
-            (0.0, 0.0, HOME[2]),
-        ),
+    waypoints: tuple[Pose, ...] = described(
+        default_path(PRRR),
         "m, m, rad",
-        "poses (x, y, phi) to visit",
+        "poses (x, y, phi) to visit, (x, y) of a point",
         min_length=1,
         max_length=100,
     )
@@ -330,24 +337,24 @@ class ControlSection(Section):
     )
     basis: Basis = described("pinned_pinned", "-", "modal basis of the controller's model")
     modes: int = described(3, "1", "controlled modes per link", ge=1, le=12)
-    frequencies_hz: tuple[Hertz, ...] | tuple[tuple[Hertz, ...], ...] = described(
+    frequencies_hz: tuple[Hertz, ...] | ListALink[Hertz] = described(
         (),
         "Hz",
-        "measured frequencies of the assembled links, by mode; one list for all links, or three; "
-        "others as in control.basis",
+        "measured frequencies of the assembled links, by mode; one list for all links, or one "
+        "each; others as in control.basis",
     )
-    links: Flags = described((True, True, True), "-", "controlled links")
-    mode_mask: tuple[tuple[bool, ...], ...] = described(
+    links: OneALink[bool] = described((True,) * PRRR.n_links, "-", "controlled links")
+    mode_mask: tuple[()] | ListALink[bool] = described(
         (), "-", "on/off per link and controlled mode; empty: all on"
     )
-    velocity_gain: tuple[Gain, Gain, Gain] = described(
+    velocity_gain: OneALink[Gain] = described(
         (1.55, 1.75, 1.7),
         "N s/m, 1/s or s",
         "k_d of mode 1 per link, half of the paper's by default",
         free=DESIGN,
     )
-    position_gain: tuple[Gain, Gain, Gain] = described(
-        (0.0, 0.0, 0.0), "N/m or 1/s2", "k_p of mode 1 per link (SRF: 1)", free=DESIGN
+    position_gain: OneALink[Gain] = described(
+        (0.0,) * PRRR.n_links, "N/m or 1/s2", "k_p of mode 1 per link (SRF: 1)", free=DESIGN
     )
     damping: EachMode[Zeta] = described(
         (),
@@ -374,7 +381,7 @@ class ControlSection(Section):
     gain_unit: Literal["N s/m", "1/s"] = described(
         "N s/m", "-", "modal force or modal acceleration"
     )
-    ratios: tuple[tuple[Gain, ...], ...] = described(
+    ratios: ListALink[Gain] = described(
         ((1.0, 0.345, 0.045), (1.0, 0.304, 0.041), (1.0, 0.321, 0.038)),
         "1",
         "efficient modal control (EMC): ratios k_dj : k_d1 per link (24); missing ones are 0",
@@ -397,14 +404,16 @@ class ControlSection(Section):
     feedthrough_factor: float = described(
         0.0, "1", "subtracted share of the residual modes' feed-through", ge=0, le=1, free=DESIGN
     )
-    notch_hz: tuple[NotchHertz, NotchHertz, NotchHertz] = described(
-        (0.0, 0.0, 0.0), "Hz", "notch filter of each link between sensors and feedback; 0: none"
+    notch_hz: OneALink[NotchHertz] = described(
+        (0.0,) * PRRR.n_links,
+        "Hz",
+        "notch filter of each link between sensors and feedback; 0: none",
     )
-    notch_depth: tuple[Share, Share, Share] = described(
-        (0.1, 0.1, 0.1), "1", "its gain at that frequency", free=DESIGN
+    notch_depth: OneALink[Share] = described(
+        (0.1,) * PRRR.n_links, "1", "its gain at that frequency", free=DESIGN
     )
-    notch_width: tuple[Width, Width, Width] = described(
-        (0.2, 0.2, 0.2), "1", "width of its stop band over that frequency", free=DESIGN
+    notch_width: OneALink[Width] = described(
+        (0.2,) * PRRR.n_links, "1", "width of its stop band over that frequency", free=DESIGN
     )
 
     @property
@@ -532,8 +541,8 @@ class DriveSection(Section):
     ripple: float = described(
         0.0, "N", "seeded force ripple, rms, new at every sample", ge=0, le=1e3, free=MACHINE
     )
-    pulse_force: tuple[Force, Force, Force] = described(
-        (0.0, 0.0, 0.0), "N", "disturbance on the sliders", free=MACHINE
+    pulse_force: OneALink[Force] = described(
+        (0.0,) * PRRR.n_links, "N", "disturbance on the sliders", free=MACHINE
     )
     pulse_start: float = described(0.0, "s", "its start", ge=0, le=100)
     pulse_length: float = described(0.001, "s", "its length", ge=0, le=100)
@@ -556,9 +565,9 @@ class LoadSection(Section):
         (0.0, 0.0), "m", "payload's centre of mass in the platform's axes"
     )
     wrench: Wrench = described(
-        (0.0, 0.0, 0.0), "N, N, N m", "steady force and moment; the run starts in equilibrium"
+        (0.0,) * PRRR.n_pose, "N, N, N m", "steady force and moment; the run starts in equilibrium"
     )
-    pulse: Wrench = described((0.0, 0.0, 0.0), "N, N, N m", "disturbance on top")
+    pulse: Wrench = described((0.0,) * PRRR.n_pose, "N, N, N m", "disturbance on top")
     pulse_start: float = described(0.0, "s", "its start", ge=0, le=100)
     pulse_length: float = described(0.001, "s", "its length", ge=0, le=100)
 
@@ -566,12 +575,12 @@ class LoadSection(Section):
 class InitialSection(Section):
     """State at t = 0."""
 
-    modal: tuple[tuple[Deflection, ...], ...] = described(
+    modal: tuple[()] | ListALink[Deflection] = described(
         (), "m", "modal coordinates per link; missing ones are 0"
     )
     load_station: float = described(0.1, "m", "where a static transverse load acts", gt=0, le=10)
-    load_deflection: tuple[Deflection, Deflection, Deflection] = described(
-        (0.0, 0.0, 0.0), "m", "chord deflection there, per link"
+    load_deflection: OneALink[Deflection] = described(
+        (0.0,) * PRRR.n_links, "m", "chord deflection there, per link"
     )
 
 
@@ -647,7 +656,26 @@ class Study(Section):
                     field = name.replace("__", ".")
                     raise StudyError(f"{field}: {section} is not a section of a study")
             target[leaf] = value
-        return parse_study(data)
+        return parse_study(for_mechanism(data, Study, self.machine.kind, data["machine"]["kind"]))
+
+    @property
+    def mechanism(self) -> Mechanism:
+        """What is selected by `machine.kind`."""
+        return MECHANISMS[self.machine.kind]
+
+    @property
+    def n_links(self) -> int:
+        """Flexible links of the mechanism, each with a drive."""
+        return self.mechanism.n_links
+
+    @property
+    def n_pose(self) -> int:
+        """Coordinates of its platform."""
+        return self.mechanism.n_pose
+
+    def each_link(self, value: Any) -> np.ndarray:
+        """A value of each link from one that may stand for all links, (n,)."""
+        return np.broadcast_to(np.asarray(value, float), (self.n_links,))
 
     @property
     def is_controlled(self) -> bool:
@@ -656,7 +684,7 @@ class Study(Section):
 
     def uncontrolled(self) -> Study:
         """The same study with no link controlled."""
-        return self.change(control__links=(False,) * 3)
+        return self.change(control__links=(False,) * self.n_links)
 
 
 def parse_study(data: dict[str, Any]) -> Study:
@@ -669,11 +697,31 @@ def parse_study(data: dict[str, Any]) -> Study:
         raise field_error("study", data, "a table of sections")
     data = with_matrices({name: _plain(value) for name, value in data.items()}, Path())
     try:
-        study = Study.model_validate(data)
+        study = validate(data)
     except ValidationError as error:
-        raise explain(error, Study, data) from None
+        raise explained(error, data) from None
     check_consistency(study)
     return study
+
+
+def explained(error: ValidationError, data: dict[str, Any]) -> StudyError:
+    """The first fault that `validate` found, in words."""
+    mechanism = mechanism_of(data)
+    return explain(error, Study, data, sizes=lengths(mechanism) if mechanism else None)
+
+
+def validate(data: dict[str, Any]) -> Study:
+    """A study, each field valid alone; its lists are as long as its mechanism says.
+
+    Raises:
+        ValidationError: a field that is not.
+    """
+    mechanism = mechanism_of(data)
+    if mechanism is None:  # which is a fault of its own
+        return Study.model_validate(data)
+    return Study.model_validate(
+        with_own_defaults(data, Study, mechanism), context=lengths(mechanism)
+    )
 
 
 def _plain(value: Any) -> Any:

@@ -146,11 +146,11 @@ def check_system(study: Study, n_patches: int) -> None:
             f"{study.electronics.sample_rate_hz:g} Hz; convert the controller",
             "s",
         )
-    system_of(section, n_patches)
+    system_of(section, study.n_links, n_patches)
 
 
 @lru_cache(maxsize=8)
-def system_of(section: StateSpaceSection, n_patches: int) -> StateSpace:
+def system_of(section: StateSpaceSection, n_links: int, n_patches: int) -> StateSpace:
     """The section's controller in real modal form, NumPy arrays.
 
     Raises:
@@ -169,13 +169,13 @@ def system_of(section: StateSpaceSection, n_patches: int) -> StateSpace:
     tell = np.zeros((order, len(c)))
     if section.anti_windup:
         tell = _sized(section.anti_windup, ANTI_WINDUP, tell.shape)
-    every = 3 * n_patches
+    every = n_links * n_patches
     if not section.inputs and not section.outputs and shape == (n_patches, n_patches):
-        groups = 3  # the same controller for each link
+        groups = n_links  # the same controller for each link
     else:
         groups = 1
         inputs, outputs = (
-            _ports(names, count, every, n_patches, kind)
+            _ports(names, count, n_links, n_patches, kind)
             for names, count, kind in (
                 (section.inputs, shape[1], "inputs"),
                 (section.outputs, shape[0], "outputs"),
@@ -237,11 +237,14 @@ def _sized(
     return matrix
 
 
-def _ports(names: tuple[str, ...], count: int, every: int, n_patches: int, kind: str) -> list[int]:
+def _ports(
+    names: tuple[str, ...], count: int, n_links: int, n_patches: int, kind: str
+) -> list[int]:
     """Places of a controller's inputs or outputs among all sensors or actuators."""
     path = f"state_space.{kind}"
     kinds = {"sensor": OUTPUTS["sensor"]} if kind == "inputs" else {"actuator": INPUTS["actuator"]}
     if not names:
+        every = n_links * n_patches
         if count != every:
             matrix = "b has columns" if kind == "inputs" else "c has rows"
             raise StudyError(
@@ -251,7 +254,7 @@ def _ports(names: tuple[str, ...], count: int, every: int, n_patches: int, kind:
         return list(range(every))
     if len(names) != count:
         raise field_error(path, names, f"{count} names, one for each of the controller's {kind}")
-    signals = [parse_signal(name, kinds, n_patches, np.ones(3), path) for name in names]
+    signals = [parse_signal(name, kinds, n_patches, np.ones(n_links), path) for name in names]
     places = [signal.row(n_patches, ()) for signal in signals]
     if len(set(places)) < len(places):
         raise field_error(path, names, "different names")

@@ -16,8 +16,7 @@ from jaxmodel.case import Drive
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import SliderError
 from studies.errors import StudyError, field_error
-from studies.study.consistency import each_link
-from studies.study.geometry import far_arms, machine_geometry
+from studies.study.geometry import far_joints, machine_geometry
 from studies.study.spec import AUTO, Study
 
 #: The field.
@@ -172,22 +171,22 @@ _SMALL = 2.0**-40
 
 
 def _drive_slopes(study: Study) -> np.ndarray:
-    """Derivatives at rest by e, e' and the memory, of F_fb and of the memory's rate, (3, 2, 3)."""
+    """Derivatives at rest by e, e' and the memory, of F_fb and of the memory's rate, (n, 2, 3)."""
     written, law = study.drive, DRIVES[study.drive.kind]
     own = {
-        x.name: each_link(written.kinds.get(law.name, {}).get(x.name, x.default))
+        x.name: study.each_link(written.kinds.get(law.name, {}).get(x.name, x.default))
         for x in law.parameters
     }
     names = [x for x in Drive._fields if x not in ("parameters", "is_locked")]
     drive = Drive(
         parameters=own,
         is_locked=np.zeros(()),
-        **{name: each_link(getattr(written, name)) for name in names},
+        **{name: study.each_link(getattr(written, name)) for name in names},
     )
-    period, zero = 1 / study.electronics.sample_rate_hz, np.zeros(3)
-    slopes = np.zeros((3, 2, 3))
+    period, zero = 1 / study.electronics.sample_rate_hz, np.zeros(study.n_links)
+    slopes = np.zeros((study.n_links, 2, 3))
     for k in range(3 if law.update else 2):
-        e, rate, memory = (_SMALL * np.ones(3) if k == j else zero for j in range(3))
+        e, rate, memory = (_SMALL * np.ones(study.n_links) if k == j else zero for j in range(3))
         error = SliderError(e, rate)
         force = np.asarray(law.force(drive, memory if law.update else None, error, True))
         slopes[:, 0, k] = force / _SMALL
@@ -208,52 +207,52 @@ def _poles(slopes: np.ndarray, scale: float) -> np.ndarray:
 
 
 def rigid_machine(study: Study) -> tuple[np.ndarray, np.ndarray]:
-    """Inertia of the machine with rigid links at its last way-point, and its sliders' rates.
+    """Inertia of the machine with rigid links at its last way-point, and its drives' rates.
 
     Args:
         study: validated study.
 
     Returns:
-        M of the pose (x, y, phi) [kg, kg m, kg m2], (3, 3); J = d rho / d pose [1, 1, m], (3, 3).
+        M of the pose (x, y, phi) [kg, kg m, kg m2], (p, p); J = d rho / d pose [1, 1, m], (n, p).
     """
     link, pose = study.link, study.motion.waypoints[-1]
     geometry, near_mass = machine_geometry(study)
-    length = each_link(link.length)
-    arm = far_arms(geometry, pose[2])
-    far = np.array(pose[:2]) + arm
+    length = study.each_link(link.length)
+    far, joint = far_joints(geometry, pose, study.n_links)
     # an unreachable pose has a message of its own
     near = geometry.legs(np).near(*far.T, length**2, (FLATTEST * length) ** 2, np)
     u = np.stack([near.x, near.y], axis=1)
     n = np.stack([-u[:, 1], u[:, 0]], axis=1)
     sine, cosine = near.across / length, near.root / length
-    # rate of each joint C_i by (x, y, phi), (3, 2, 3)
-    joint = np.concatenate(
-        [np.tile(np.eye(2), (3, 1, 1)), np.stack([-arm[:, 1], arm[:, 0]], axis=1)[:, :, None]],
-        axis=2,
-    )
     by_height = np.einsum("ij,ijk->ik", n, joint)
     turn = by_height / (length * cosine)[:, None]
     rates = np.einsum("ij,ijk->ik", u, joint) + (sine / cosine)[:, None] * by_height
-    mass = each_link(link.density) * each_link(link.width) * each_link(link.thickness) * length
+    mass = (
+        study.each_link(link.density)
+        * study.each_link(link.width)
+        * study.each_link(link.thickness)
+        * length
+    )
     carried = near_mass + mass
     coupling = mass * length / 2 * sine
     inertia = np.einsum("i,ij,ik->jk", carried, rates, rates)
     inertia += np.einsum("i,ij,ik->jk", mass * length**2 / 3, turn, turn)
     mixed = np.einsum("i,ij,ik->jk", coupling, rates, turn)
-    inertia += _platform(study, pose[2]) - mixed - mixed.T
+    inertia += _platform(study, pose) - mixed - mixed.T
     return inertia, rates
 
 
-def _platform(study: Study, phi: float) -> np.ndarray:
-    """Inertia of platform and payload about the reference point, (3, 3)."""
+def _platform(study: Study, pose: tuple[float, ...]) -> np.ndarray:
+    """Inertia of platform and payload about the reference point, (p, p)."""
     machine, load = study.machine, study.load
-    cosine, sine = np.cos(phi), np.sin(phi)
+    mass = (machine.platform_mass + load.mass) * np.eye(2)
+    if len(pose) == 2:
+        return mass
+    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
     offset = np.array([[cosine, -sine], [sine, cosine]]) @ np.array(load.offset)
-    inertia = np.diag([machine.platform_mass + load.mass] * 2 + [machine.platform_inertia])
-    inertia[2, 2] += load.inertia + load.mass * offset @ offset
-    inertia[:2, 2] = load.mass * np.array([-offset[1], offset[0]])
-    inertia[2, :2] = inertia[:2, 2]
-    return inertia
+    mixed = load.mass * np.array([[-offset[1]], [offset[0]]])
+    turning = machine.platform_inertia + load.inertia + load.mass * offset @ offset
+    return np.block([[mass, mixed], [mixed.T, np.array([[turning]])]])
 
 
 def _disturbance_ends(study: Study) -> list[float]:

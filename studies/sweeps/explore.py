@@ -205,7 +205,7 @@ def _placement(table: CaseTable) -> Placement:
 
     centers = fields.numbers("patches.centers")
     if centers.ndim == 2:  # one list for all links
-        centers = np.repeat(centers[:, None], 3, axis=1)
+        centers = np.repeat(centers[:, None], table.study.n_links, axis=1)
     is_on = fields.numbers("control.links") * (fields.raw("control.feedback") != "none")[:, None]
     lengths = ("link.length", "patches.actuator_length", "patches.sensor_length")
     length, actuator, sensor = (1e3 * all_cases(fields.each_link(name)) for name in lengths)

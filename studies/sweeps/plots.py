@@ -23,7 +23,6 @@ from studies.show import figures
 from studies.show.sketch import ACTUATOR, SENSOR
 from studies.space.axes import SHOWN_AS
 from studies.space.spec import BlockNode
-from studies.study.consistency import each_link
 from studies.study.margin import ENOUGH, HIGHEST
 from studies.sweeps.records import MARGIN
 from studies.sweeps.show import label, recommended, shown_metric, shown_value
@@ -420,7 +419,7 @@ def _placements(data: SweepData, y: str) -> Figure:
     centers, value = data["patches.centers"], shown_metric(data, y)
     study = data.spec.study
     sizes = (study.link.length, study.patches.actuator_length, study.patches.sensor_length)
-    links = list(dict.fromkeys(zip(*(map(float, each_link(x)) for x in sizes), strict=True)))
+    links = list(dict.fromkeys(zip(*(map(float, study.each_link(x)) for x in sizes), strict=True)))
     chosen = recommended(data, y, N_PLACEMENTS)
     is_ok = (data["status"] == status.OK) & np.isfinite(value)
     others = [name for name in swept_names(data) if name != "patches.centers"]

@@ -213,7 +213,7 @@ def _uncontrolled_links(data: SweepData, metric: str, case: int) -> list[tuple[s
     dims = data.variables[metric.partition("[")[0]].dims
     if "link" not in dims or "link=" in metric:
         return []
-    idle = set(range(3)) - set(np.flatnonzero(counted_links(data)).tolist())
+    idle = set(np.flatnonzero(~counted_links(data)).tolist())
     unit = readable(unit_of_metric(data, metric))[1]
     names = [(str(link + 1), f"{metric}[link={link + 1}]") for link in sorted(idle)]
     return [(k, f"{shown_metric(data, name)[case]:.4g} {unit}".rstrip()) for k, name in names]

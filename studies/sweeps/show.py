@@ -353,7 +353,8 @@ def counted_text(data: SweepData, by: str) -> str:
     axes = list(data.variables[metric].dims[1:])
     parts = []
     if "link" in axes and "link=" not in by:
-        parts.append(links_text(tuple(np.flatnonzero(counted_links(data)).tolist())))
+        counted = counted_links(data)
+        parts.append(links_text(tuple(np.flatnonzero(counted).tolist()), len(counted)))
     rest = [axis for axis in axes if axis != "link" and f"{axis}=" not in by]
     parts += ["x and y" if axis == "pose_axis" else f"all {axis}s" for axis in rest]
     return f"largest of {' and '.join(parts)}" if parts else "one number"

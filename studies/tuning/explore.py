@@ -16,7 +16,6 @@ from studies.show.figures import is_wide
 from studies.show.units import readable
 from studies.show.words import baseline_text
 from studies.store import Variable, read_store
-from studies.study.consistency import each_link
 from studies.study.spec import Study
 from studies.tuning.check import tuned_study
 from studies.tuning.folder import MANIFEST, RESULTS
@@ -130,7 +129,7 @@ def _placement(spec: TuneSpec, data: dict[str, Variable]) -> Placement:
     links = {family.name: family.study(spec.study).control.links for family in spec.families}
     study = spec.study
     fields = study.link.length, study.patches.actuator_length, study.patches.sensor_length
-    length, actuator, sensor = (np.broadcast_to(1e3 * each_link(x), shape) for x in fields)
+    length, actuator, sensor = (np.broadcast_to(1e3 * study.each_link(x), shape) for x in fields)
     is_on = np.array([links[str(name)] for name in data["start_family"].data])
     return Placement(
         length=length, actuator=actuator, sensor=sensor, centers=centers, is_controlled=is_on

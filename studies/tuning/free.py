@@ -25,7 +25,7 @@ from studies.space.free import (
     join_numbers,
     plain_numbers,
 )
-from studies.study.consistency import each_link, patch_centers, patch_pitch
+from studies.study.consistency import patch_centers, patch_pitch
 from studies.study.numbers import Numbers
 from studies.study.paths import Parts
 from studies.study.spec import DESIGN, Study
@@ -87,8 +87,12 @@ def _check_decided(numbers: Sequence[Free]) -> None:
 def _placement(bounds: Any, study: Study, path: str) -> tuple[list[Free], Place]:
     if not isinstance(bounds, dict) or set(bounds) != {"kind"} or bounds["kind"] not in PLACEMENTS:
         raise field_error(path, bounds, "{kind = 'same'} or {kind = 'per_link'}")
-    centers, pitch, length = patch_centers(study), patch_pitch(study), each_link(study.link.length)
-    links, count = (1 if bounds["kind"] == "same" else 3), centers.shape[1]
+    centers, pitch, length = (
+        patch_centers(study),
+        patch_pitch(study),
+        study.each_link(study.link.length),
+    )
+    links, count = (1 if bounds["kind"] == "same" else study.n_links), centers.shape[1]
     if links == 1:  # room on all links
         pitch, length = pitch.max(keepdims=True), length.min(keepdims=True)
     free = length - count * pitch
@@ -134,5 +138,5 @@ def _place_patches(
         kept = jnp.maximum(1 - shares[:, k], 1e-12) ** (1 / (count - k))
         begin, left = begin + left * (1 - kept), left * kept
         centers.append(begin + pitch * (k + 0.5))
-    center = jnp.broadcast_to(jnp.stack(centers, axis=-1), (3, count))
+    center = jnp.broadcast_to(jnp.stack(centers, axis=-1), (*length.shape, count))
     return numbers | {"patches.centers": jnp.where(is_kept, numbers["patches.centers"], center)}

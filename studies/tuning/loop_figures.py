@@ -172,7 +172,7 @@ def distance_of_path(structure: Structure, case: Case) -> Array:
     """Distance of the straight lines between way-points from singularities [rad], ()."""
     points, share = case.path.waypoints, jnp.linspace(0.0, 1.0, PATH_POINTS)[:, None, None]
     line = points[:-1] + share * (points[1:] - points[:-1])
-    pose = jnp.concatenate([points, jnp.reshape(line, (-1, 3))])
+    pose = jnp.concatenate([points, jnp.reshape(line, (-1, points.shape[-1]))])
     return singularity_distance(prepare(structure, case).loop.plant, pose)
 
 

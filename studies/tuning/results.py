@@ -111,7 +111,7 @@ def _fresh(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
     axis, both = ("scenario",), ("family", "scenario")
     fresh = {}
     for name, column in fresh_columns(spec).items():
-        array = as_numbers(column)
+        array = as_numbers(column, spec.study.n_links)
         dims = tuple(f"{name}_{k}" for k in range(1, array.ndim))
         entry = parse_entry(name)
         unit = field_unit(entry.field) if entry else "1"
@@ -123,7 +123,7 @@ def _fresh(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
     fresh["fresh_objective"] = Variable(each("objective"), both, "1", "objective, fresh machines")
     fresh["fresh_status"] = Variable(each("status"), both, *STATUS_LABEL)
     fresh["baseline_status"] = Variable(findings.baseline.status, axis, *STATUS_LABEL)
-    links = links_text(spec.counted_links)
+    links = links_text(spec.counted_links, spec.study.n_links)
     for name, baseline in findings.baseline.metrics.items():
         unit = METRICS[name.partition("[")[0]].unit
         values = np.stack([design.metrics[name] for design in findings.judged])
@@ -188,7 +188,7 @@ def _random(findings: TuneFindings) -> dict[str, Variable]:
 
 def _references(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
     """No control, and the gain factor alone."""
-    links, references = links_text(spec.counted_links), {}
+    links, references = links_text(spec.counted_links, spec.study.n_links), {}
     scan, axis = findings.references.scan, ("scanned",)
     designs = findings.references.uncontrolled, findings.references.gain_alone
     for label, text, design in zip(

@@ -8,6 +8,8 @@ FIVE_BAR = Mechanism(
     text="five-bar",
     n_links=2,
     n_pose=2,
+    home=(0.0, 0.2),
     build=build,
+    allowed="a pose where crank and link reach each joint without being in line",
     parameters=PARAMETERS,
 )

@@ -13,9 +13,9 @@ from jaxmodel.table import Parameter
 
 
 class FiveBarGeometry(NamedTuple):
-    """Cranks about pivots on the x axis, which are as far from O on either side."""
+    """Cranks about pivots on the x axis, on either side of O."""
 
-    pivot_distance: Array  # from one pivot to the other [m], ()
+    pivot_distance: Array  # of each pivot from O [m], () or (2,)
     crank_length: Array  # a [m], () or (2,)
     elbow: Array  # 1 or -1, see `Cranks`, (2,)
     zero_angle: Array  # direction of a crank at rho = 0 [rad], (2,)
@@ -24,15 +24,14 @@ class FiveBarGeometry(NamedTuple):
         """The links meet in a point."""
 
     def size(self) -> float:
-        """Distance of the pivots, or reach."""
-        return float(np.max(self.pivot_distance) + 2 * np.max(self.crank_length))
+        """From one crank's far side to the other's."""
+        return 2 * float(np.max(self.pivot_distance) + np.max(self.crank_length))
 
     def legs(self, xp: Any = jnp) -> Cranks:
         """A_1 on the left, A_2 on the right."""
         zero = xp.asarray(self.zero_angle)
-        half = xp.asarray(self.pivot_distance) / 2
         return Cranks(
-            x=xp.stack([-half, half]),
+            x=xp.asarray([-1.0, 1.0]) * xp.asarray(self.pivot_distance),
             y=xp.zeros(2),
             length=xp.broadcast_to(xp.asarray(self.crank_length), zero.shape),
             elbow=xp.asarray(self.elbow),
@@ -42,7 +41,7 @@ class FiveBarGeometry(NamedTuple):
 
 
 PARAMETERS = (
-    Parameter("pivot_distance", 0.2, "m", "from one pivot to the other", 0.01, 10.0),
+    Parameter("pivot_distance", 0.1, "m", "distance of the pivot from the origin", 0.005, 5.0),
     Parameter("crank_length", 0.16, "m", "of the crank", 1e-3, 10.0),
     Parameter("crank_inertia", 4e-3, "kg m2", "of crank and motor about the pivot", 1e-8, 1e3),
 )

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxmodel.lazy import jnp
-from jaxmodel.mechanisms.contract import Near, polar, safe_root
+from jaxmodel.mechanisms.contract import SINGULAR_MARGIN, Near, polar, safe_root
 from jaxmodel.parameters import Array
 
 #: Body angles psi [rad] of the platform joints for the two assemblies that fit the paper's text.
@@ -43,6 +43,15 @@ class Guides(NamedTuple):
             across=h,
             position=s - root,
         )
+
+    def misplaced(self, x: np.ndarray, y: np.ndarray, length: np.ndarray) -> list[str]:
+        """Joints outside their guide, or beyond the link's length inside it."""
+        inside = self.near(x, y, length**2, 0.0, np).across
+        return [
+            f"link {i + 1} is {own:.4g} m long, its joint lies {h:.4g} m inside its guide"
+            for i, (h, own) in enumerate(zip(inside, length, strict=True))
+            if not SINGULAR_MARGIN <= h / own < np.sqrt(1 - SINGULAR_MARGIN**2)
+        ]
 
     def carriers(self, near: np.ndarray) -> np.ndarray:
         """The guides, from corner to corner of the triangle."""

@@ -58,6 +58,17 @@ class Cranks(NamedTuple):
             curvature=1 / arc,
         )
 
+    def misplaced(self, x: np.ndarray, y: np.ndarray, length: np.ndarray) -> list[str]:
+        """Joints too far from their pivot, or too near to it."""
+        away = np.hypot(x - self.x, y - self.y)
+        reach = zip(away, np.abs(length - self.length), length + self.length, strict=True)
+        return [
+            f"the joint of link {i + 1} is {far:.4g} m from its crank's pivot, of a reach from "
+            f"{least:.4g} to {most:.4g} m"
+            for i, (far, least, most) in enumerate(reach)
+            if not least < far < most
+        ]
+
     def carriers(self, near: np.ndarray) -> np.ndarray:
         """The cranks, from pivot to link."""
         return np.stack([np.stack([self.x, self.y], axis=1), near], axis=1)

@@ -182,7 +182,7 @@ def _compare_episodes(
     """Random input with sensor faults, reset in between."""
     exported = at.exported
     rail = rail_samples(exported.study.electronics.sample_rate_hz)
-    top, shape = int(exported.controller.adc_top), (3, exported.n_patches)
+    top, shape = int(exported.controller.adc_top), (exported.n_links, exported.n_patches)
     differing = faulty = total = 0
     each = []
     for codes in episodes(EPISODES, shape, top, rail):

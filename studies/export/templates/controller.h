@@ -49,9 +49,9 @@ extern "C" {
 typedef {{ NAME }}_REAL {{ name }}_real;
 {% endif %}
 
-#define {{ NAME }}_N_LINKS 3
+#define {{ NAME }}_N_LINKS {{ n_links }}
 #define {{ NAME }}_N_PATCHES {{ n_patches }}
-#define {{ NAME }}_N_CHANNELS {{ 3 * n_patches }}
+#define {{ NAME }}_N_CHANNELS {{ n_links * n_patches }}
 {% if blocks %}
 #define {{ NAME }}_N_STATES {{ blocks.names | length }} /* of all systems */
 {% else %}
@@ -105,13 +105,13 @@ int {{ name }}_step({{ name }}_state *state, const {{ wire }} sensor[{{ NAME }}_
 
 /* State of the shaper: past references, newest at `newest`. */
 typedef struct {
-    {{ word }} past[{{ NAME }}_SHAPER_LENGTH][3];
+    {{ word }} past[{{ NAME }}_SHAPER_LENGTH][{{ n_pose }}];
     uint32_t newest;
 } {{ name }}_shaper;
 
 /* Start at rest in a pose{% if not fixed %}; one that is not finite counts as zero{% endif %}. Without it, the result of
  * {{ name }}_shape_step means nothing, but stays inside the structure. */
-void {{ name }}_shape_init({{ name }}_shaper *shaper, const {{ word }} reference[3]);
+void {{ name }}_shape_init({{ name }}_shaper *shaper, const {{ word }} reference[{{ n_pose }}]);
 
 /* One sample of the reference pose (x, y, phi): as planned in, shaped out.
 {% if fixed %}
@@ -120,8 +120,8 @@ void {{ name }}_shape_init({{ name }}_shaper *shaper, const {{ word }} reference
  * In any units. A reference with a coordinate that is not finite is replaced by the last finite one.
 {% endif %}
  */
-void {{ name }}_shape_step({{ name }}_shaper *shaper, const {{ word }} reference[3],
-    {{ word }} shaped[3]);
+void {{ name }}_shape_step({{ name }}_shaper *shaper, const {{ word }} reference[{{ n_pose }}],
+    {{ word }} shaped[{{ n_pose }}]);
 
 #ifdef __cplusplus
 }

@@ -23,18 +23,18 @@ void {{ name }}_init({{ name }}_state *s)
 {
     int i;
 
-    for (i = 0; i < 3; i++) {
+    for (i = 0; i < {{ n_links }}; i++) {
         s->force[i] = R(0.0);
         s->memory[i] = R(0.0);
     }
 }
 
-void {{ name }}_step({{ name }}_state *s, const real error[3], const real error_rate[3],
-                     const real feedforward[3], real feedback[3])
+void {{ name }}_step({{ name }}_state *s, const real error[{{ n_links }}], const real error_rate[{{ n_links }}],
+                     const real feedforward[{{ n_links }}], real feedback[{{ n_links }}])
 {
     int i;
 
-    for (i = 0; i < 3; i++) {
+    for (i = 0; i < {{ n_links }}; i++) {
         const real demand = feedforward[i] + s->force[i];
         const real above = demand > {{ NAME }}_LIMIT[i] ? {{ NAME }}_LIMIT[i] : demand;
         const real motor = above < -{{ NAME }}_LIMIT[i] ? -{{ NAME }}_LIMIT[i] : above;

@@ -25,11 +25,11 @@ typedef {{ NAME }}_REAL {{ name }}_real;
 
 #define {{ NAME }}_RATE {{ rate }} /* Hz */
 
-extern const {{ name }}_real {{ NAME }}_LIMIT[3]; /* N, of each motor, +- */
+extern const {{ name }}_real {{ NAME }}_LIMIT[{{ n_links }}]; /* N, of each motor, +- */
 
 typedef struct {
-    {{ name }}_real force[3];  /* N, feedback that acts during this sample */
-    {{ name }}_real memory[3]; /* of the law */
+    {{ name }}_real force[{{ n_links }}];  /* N, feedback that acts during this sample */
+    {{ name }}_real memory[{{ n_links }}]; /* of the law */
 } {{ name }}_state;
 
 /* At rest. */
@@ -37,9 +37,9 @@ void {{ name }}_init({{ name }}_state *state);
 
 /* One sample: reference less measured position [m] and speed [m/s] of each slider, and the
  * feed-forward that acts during this sample [N]; returns the feedback of the next one [N]. */
-void {{ name }}_step({{ name }}_state *state, const {{ name }}_real error[3],
-                     const {{ name }}_real error_rate[3], const {{ name }}_real feedforward[3],
-                     {{ name }}_real feedback[3]);
+void {{ name }}_step({{ name }}_state *state, const {{ name }}_real error[{{ n_links }}],
+                     const {{ name }}_real error_rate[{{ n_links }}], const {{ name }}_real feedforward[{{ n_links }}],
+                     {{ name }}_real feedback[{{ n_links }}]);
 
 #ifdef __cplusplus
 }

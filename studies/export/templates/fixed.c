@@ -353,14 +353,14 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
     return 0;
 }
 
-void {{ name }}_shape_step({{ name }}_shaper *shaper, const int32_t reference[3], int32_t shaped[3])
+void {{ name }}_shape_step({{ name }}_shaper *shaper, const int32_t reference[{{ n_pose }}], int32_t shaped[{{ n_pose }}])
 {
-    int64_t sum[3] = {0, 0, 0};
+    int64_t sum[{{ n_pose }}] = {0};
     uint32_t at, last;
     int k, axis;
 
     {{ shared.advance() }}
-    for (axis = 0; axis < 3; axis++) {
+    for (axis = 0; axis < {{ n_pose }}; axis++) {
         shaper->past[shaper->newest][axis] = reference[axis];
     }
     for (k = 0; k < N_TAPS; k++) {
@@ -368,11 +368,11 @@ void {{ name }}_shape_step({{ name }}_shaper *shaper, const int32_t reference[3]
         if (at >= {{ NAME }}_SHAPER_LENGTH) {
             at -= {{ NAME }}_SHAPER_LENGTH;
         }
-        for (axis = 0; axis < 3; axis++) {
+        for (axis = 0; axis < {{ n_pose }}; axis++) {
             sum[axis] += (int64_t)WEIGHT[k] * shaper->past[at][axis];
         }
     }
-    for (axis = 0; axis < 3; axis++) {
+    for (axis = 0; axis < {{ n_pose }}; axis++) {
         shaped[axis] = {{ pose }}limited({{ pose }}shifted(sum[axis], WEIGHT_SHIFT));
     }
 }

@@ -26,7 +26,6 @@ from studies.fitting.spec import (
 )
 from studies.fitting.tables import column, read_columns
 from studies.study.cases import build_structure
-from studies.study.consistency import each_link
 from studies.study.signals import INPUTS, OUTPUTS, Signal, parse_signal
 
 #: Rows of a measurement that a fit takes: a minute or two of work.
@@ -50,7 +49,7 @@ def signals_of(spec: FitSpec, entry: Common, path: str) -> tuple[Signal, ...]:
     """Input and output of an entry, or its outputs."""
     if not isinstance(entry, OutputEntry | DecayEntry):
         return ()
-    sizes = build_structure(spec.study).n_patches, each_link(spec.study.link.length)
+    sizes = build_structure(spec.study).n_patches, spec.study.each_link(spec.study.link.length)
     if isinstance(entry, DecayEntry):
         moving = {x: form for x, form in OUTPUTS.items() if x != "motor"}
         return tuple(

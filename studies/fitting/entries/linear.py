@@ -68,7 +68,7 @@ def make_modes(spec: FitSpec, models: Models, entry: ModesEntry, path: str) -> M
             raise StudyError(f"{path}.damping_sigma: missing beside damping_ratio")
         sigma = each(entry.damping_sigma, count, f"{path}.damping_sigma")
     if entry.shapes:
-        size = 3 * models.bench.n_patches
+        size = models.bench.study.n_links * models.bench.n_patches
         if entry.ends == "held":
             raise StudyError(f"{path}.shapes: allowed with ends = 'machine' only")
         if len(entry.shapes) != count or any(len(x) != size for x in entry.shapes):

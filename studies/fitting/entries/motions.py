@@ -17,7 +17,6 @@ from studies.fitting.entries.common import (
 )
 from studies.fitting.kinds.contract import Measurement
 from studies.fitting.kinds.figures import Compared, Figures, Switch
-from studies.fitting.kinds.motions import OFF
 from studies.fitting.kinds.traces import Band, Settling, Trace
 from studies.fitting.spec import FiguresEntry, FitSpec, SettlingEntry, TraceEntry
 from studies.study.entries import entry_sizes, parse_entries
@@ -65,7 +64,7 @@ def make_settling(spec: FitSpec, models: Models, entry: SettlingEntry, path: str
     share = entry.band_percent
     band = Band(entry.band or 0.0, None)
     if share is not None:
-        band = Band(share / 100, models.motions.of(OFF))
+        band = Band(share / 100, models.motions.uncontrolled())
     motion = models.motions.of(entry.links)
     data = motion, signal, band, entry.time_s, entry.sigma_s
     return Settling(entry.name, entry.check, *data)
@@ -74,6 +73,7 @@ def make_settling(spec: FitSpec, models: Models, entry: SettlingEntry, path: str
 def make_figures(spec: FitSpec, models: Models, entry: FiguresEntry, path: str) -> Measurement:
     """Metrics."""
     links, modes = entry.links or spec.study.control.links, entry.modes or spec.study.control.modes
+    off = (False,) * len(links)
     is_on = spec.study.control.feedback != "none" and any(links)
     if entry.of == "reduction" and not is_on:
         raise StudyError(f"{path}.of = 'reduction': no link is under control in this study")
@@ -95,7 +95,7 @@ def make_figures(spec: FitSpec, models: Models, entry: FiguresEntry, path: str) 
         compared.append(
             Compared(
                 entries=entries,
-                switch=Switch(OFF if entry.of == "uncontrolled" else links, modes),
+                switch=Switch(off if entry.of == "uncontrolled" else links, modes),
                 is_reduction=entry.of == "reduction",
                 is_amplitude=entry.amplitude,
                 is_largest=entry.take == "largest",

@@ -16,7 +16,7 @@ from studies.engine.function import fastest_function
 from studies.engine.plan import lane_unit, padded_rows
 from studies.errors import StudyError
 from studies.fitting.kinds.contract import Measurement
-from studies.fitting.kinds.motions import OFF, check_finished, smooth_run
+from studies.fitting.kinds.motions import check_finished, smooth_run
 from studies.space.free import Place, Placing
 from studies.study.cases import case_of
 from studies.study.entries import Entries
@@ -27,7 +27,7 @@ from studies.study.spec import Study
 class Switch(NamedTuple):
     """What is under control."""
 
-    links: tuple[bool, bool, bool]
+    links: tuple[bool, ...]
     modes: int  # of each of these links
 
 
@@ -158,7 +158,7 @@ class Figures(Measurement):
 
 
 def _off(one: Compared) -> Switch:
-    return one.switch._replace(links=OFF)
+    return one.switch._replace(links=(False,) * len(one.switch.links))
 
 
 def _switched_case(

@@ -24,7 +24,6 @@ from studies.study.signals import Signal
 from studies.study.spec import Study
 
 #: No link under control.
-OFF = (False, False, False)
 #: What a run records of each kind of output.
 RECORDED = {
     "sensor": "sensor_voltage",
@@ -66,9 +65,9 @@ class Motion:
         self._kept: tuple[Any, Any] = None, None
 
     @property
-    def n_patches(self) -> int:
-        """Pairs of patches on each link."""
-        return self._structure.n_patches
+    def patches(self) -> tuple[int, int]:
+        """Links, and pairs of patches on each."""
+        return self._structure.n_links, self._structure.n_patches
 
     def add(self, signal: Signal) -> None:
         """Record what this output needs, too."""
@@ -115,6 +114,10 @@ class Motions:
         )
         self._places, self._moving = places, moving
         self._known: dict[tuple[bool, ...] | None, Motion] = {}
+
+    def uncontrolled(self) -> Motion:
+        """The run with no link under control."""
+        return self.of((False,) * self._study.n_links)
 
     def of(self, links: tuple[bool, ...] | None) -> Motion:
         """The run with these links under control; None: those of the study."""

@@ -50,9 +50,9 @@ class _BenchMeasurement(Measurement):
         self.frequency, self._noise, self._unit = frequency, noise, unit
 
     @property
-    def n_patches(self) -> int:
-        """Pairs of patches on each link."""
-        return self._bench.n_patches
+    def patches(self) -> tuple[int, int]:
+        """Links, and pairs of patches on each."""
+        return self._bench.study.n_links, self._bench.n_patches
 
     def predict(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
         plant = self._bench.plant(self._pose, values, has_slopes)

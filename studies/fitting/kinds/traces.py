@@ -53,9 +53,9 @@ class Trace(Measurement):
         motion.add(signal)
 
     @property
-    def n_patches(self) -> int:
-        """Pairs of patches on each link."""
-        return self._motion.n_patches
+    def patches(self) -> tuple[int, int]:
+        """Links, and pairs of patches on each."""
+        return self._motion.patches
 
     def predict(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
         model, slope, _ = self._adjusted(values, has_slopes)

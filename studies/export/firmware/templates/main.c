@@ -16,7 +16,7 @@ void timer_handler(void);
 static {{ name }}_state state;
 static {{ name }}_shaper shaper;
 static wire sensor[{{ NAME }}_N_CHANNELS], actuator[{{ NAME }}_N_CHANNELS];
-static word planned[3], shaped[3];
+static word planned[{{ n_pose }}], shaped[{{ n_pose }}];
 static uint32_t settling;
 
 /* For the debugger, or for whatever supervises the machine. */

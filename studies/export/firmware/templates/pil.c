@@ -28,7 +28,7 @@ void fault_handler(void);
 static {{ name }}_state state;
 static {{ name }}_shaper shaper;
 static wire sensor[MOST][{{ NAME }}_N_CHANNELS], actuator[MOST][{{ NAME }}_N_CHANNELS];
-static word reference[MOST][3], shaped[MOST][3];
+static word reference[MOST][{{ n_pose }}], shaped[MOST][{{ n_pose }}];
 static int32_t fault[MOST];
 static uint32_t ticks[MOST];
 
