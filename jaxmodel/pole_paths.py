@@ -1,6 +1,6 @@
 """Poles of the closed loop, traced from those of the uncontrolled machine as gains rise.
 
-With gains times k, the loop has its poles where det(1/k - L(s)) = 0. The three modes of one order,
+With gains times k, the loop has its poles where det(1/k - L(s)) = 0. The modes of one order,
 one per link, lie close together; their poles are found jointly by the Ehrlich-Aberth iteration,
 which keeps them apart. det itself has poles where the uncontrolled machine has them: these are
 found first, in the same way from those of links with held ends, and multiplied out. Elementwise
@@ -22,66 +22,66 @@ STRIDE = 0.1
 _TERMS = 8
 
 
-class PoleTriplet(NamedTuple):
-    """Three poles being traced."""
+class OrderPoles(NamedTuple):
+    """Poles of one mode order being traced, one per link."""
 
-    pole: Pair  # s [1/s], (3,)
-    shift: Pair  # exp(-s T), (3,)
-    step: Array  # size of the last step over that of the pole [1], (3,)
+    pole: Pair  # s [1/s], (n,)
+    shift: Pair  # exp(-s T), (n,)
+    step: Array  # size of the last step over that of the pole [1], (n,)
 
 
-def refine_open_loop_poles(response: LoopResponse, held: Pair, triplet: PoleTriplet) -> PoleTriplet:
-    """Refine three poles of the uncontrolled machine.
+def refine_open_loop_poles(response: LoopResponse, held: Pair, traced: OrderPoles) -> OrderPoles:
+    """Refine the poles of an order of the uncontrolled machine.
 
     Args:
         response: of the loop.
-        held: poles of the links with held ends [1/s], (3,).
-        triplet: so far.
+        held: poles of the links with held ends [1/s], (n,).
+        traced: so far.
     """
 
     def function(s: Pair, shift: Pair) -> Pair:
         return evaluate_loop_gain(response, s, shift).pose_inverse.inverse()
 
-    return _improved(response, function, held, triplet)
+    return _improved(response, function, held, traced)
 
 
 def refine_closed_loop_poles(
-    response: LoopResponse, own: Pair, triplet: PoleTriplet, inverse: Array
-) -> PoleTriplet:
-    """Refine three poles of the closed loop.
+    response: LoopResponse, own: Pair, traced: OrderPoles, inverse: Array
+) -> OrderPoles:
+    """Refine the poles of an order of the closed loop.
 
     Args:
         response: of the loop.
-        own: poles without control [1/s], (3,).
-        triplet: so far.
+        own: poles without control [1/s], (n,).
+        traced: so far.
         inverse: 1/k [1], ().
     """
-    level = Pair(inverse * jnp.ones_like(triplet.step[0]), jnp.zeros_like(triplet.step[0]))
+    level = Pair(inverse * jnp.ones_like(traced.step[0]), jnp.zeros_like(traced.step[0]))
 
     def function(s: Pair, shift: Pair) -> Pair:
         return characteristic_polynomial(evaluate_loop_gain(response, s, shift), level)
 
-    return _improved(response, function, own, triplet)
+    return _improved(response, function, own, traced)
 
 
 def _improved(
     response: LoopResponse,
     function: Callable[[Pair, Pair], Pair],
     poles: Pair,
-    triplet: PoleTriplet,
-) -> PoleTriplet:
+    traced: OrderPoles,
+) -> OrderPoles:
     """One iteration towards zeros of a function with these poles."""
-    one = jnp.ones_like(triplet.step[0])
+    count, one = len(traced.step), jnp.ones_like(traced.step[0])
     zero = jnp.zeros_like(one)
 
-    def improve(triplet: PoleTriplet, _: None) -> tuple[PoleTriplet, None]:
-        s, shift = triplet.pole[0], triplet.shift[0]
+    def improve(traced: OrderPoles, _: None) -> tuple[OrderPoles, None]:
+        s, shift = traced.pole[0], traced.shift[0]
         value, change = jax.jvp(function, (s, shift), (Pair(one, zero), shift * -response.period))
         slope = change * value.inverse()
-        for k in range(3):
+        for k in range(count):
             slope = slope + (s - poles[k]).inverse()
-        for k in (1, 2):
-            slope = slope - (s - triplet.pole[k]).inverse()
+        for k in range(1, count):
+            slope = slope - (s - traced.pole[k]).inverse()
         move = -slope.inverse()
         size = jnp.sqrt((move.re * move.re + move.im * move.im) / (s.re * s.re + s.im * s.im))
         move = move * (STRIDE / jnp.maximum(size, STRIDE))
@@ -89,11 +89,11 @@ def _improved(
         growth = angle * (1 / _TERMS) + 1.0
         for n in range(_TERMS - 1, 0, -1):
             growth = growth * angle * (1 / n) + 1.0
-        new = PoleTriplet(s + move, shift * growth, size)
+        new = OrderPoles(s + move, shift * growth, size)
 
         def turned(old: Array, last: Array) -> Array:
             return jnp.concatenate([old[1:], last[None]])
 
-        return jax.tree.map(turned, triplet, new), None
+        return jax.tree.map(turned, traced, new), None
 
-    return jax.lax.scan(improve, triplet, None, length=3)[0]
+    return jax.lax.scan(improve, traced, None, length=count)[0]

@@ -178,7 +178,7 @@ def controlled_first(response: LoopResponse, link_mask: np.ndarray, count: int) 
 
 
 class AssembledModes(NamedTuple):
-    """Modes of the uncontrolled machine, m = 3 + 3 R; damping to first order."""
+    """Modes of the uncontrolled machine, m = p + n R; damping to first order."""
 
     omega: Array  # ascending [rad/s], (m,)
     decay: Array  # zeta omega [1/s], (m,)
@@ -194,7 +194,7 @@ def assembled_modes(response: LoopResponse | PlantResponse) -> AssembledModes:
     """
 
     def side_by_side(x: Array) -> Array:
-        return jnp.concatenate([x[0], x[1], x[2]], axis=1)
+        return jnp.concatenate([x[i] for i in range(len(x))], axis=1)
 
     enter, leave = side_by_side(response.enter), side_by_side(response.leave)
     # entries of both have one sign; without coupling the pose does not feel the links at all
@@ -272,7 +272,7 @@ def _one_link(response: LoopResponse, i: int, has_channels: bool) -> LoopRespons
 def _link_gain(
     response: LoopResponse, s: Pair, shift: Pair, late: Pair | None, spread: Array | None
 ) -> tuple[list[Pair], list[Pair], Pair]:
-    """`own` and `joint` of a link's `LoopGain`, and its share in the pose's stiffness, (3, 3)."""
+    """`own` and `joint` of a link's `LoopGain`, and its share in the pose's stiffness, (p, p)."""
     observe, act = response.observe, response.act
     sampling = 2 * np.pi / response.period
     held = -shift + 1.0
@@ -299,7 +299,7 @@ def _link_gain(
 
 
 def _share_in_pose(response: LoopResponse, s: Pair) -> Pair:
-    """What the modes of a link without channels take from the pose's stiffness, (3, 3)."""
+    """What the modes of a link without channels take from the pose's stiffness, (p, p)."""
     inverse = (s * s + s * response.decay + response.square).inverse()
     return _through(response.enter, response.leave, inverse).sum(0)
 

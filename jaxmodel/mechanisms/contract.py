@@ -23,7 +23,8 @@ class Mechanism(NamedTuple):
 
     `build(own, machine, xp)` returns its `Geometry` and the mass that moves with B on each leg
     [kg]: `own` are its parameters, `machine` the numbers of `[machine]` (angles in radians as
-    `guide_angle` and `joint_angle`), `xp` NumPy or `jax.numpy`.
+    `guide_angle` and `joint_angle`), `xp` NumPy or `jax.numpy`. All may have leading axes of cases,
+    and so has every array of the geometry.
     """
 
     name: str  # in study files

@@ -51,7 +51,7 @@ def unknown_to_controller(possible: Possible, study: Study) -> dict[str, list[fl
         if field == MODULUS:
             link = int(index.rstrip("]")) if bracket else 0
             factor, modulus = (
-                np.broadcast_to(x, 3)[link]
+                study.each_link(x)[link]
                 for x in (study.link.stiffness_factor, study.link.youngs_modulus)
             )
             column = factor * column / modulus

@@ -56,7 +56,7 @@ def _tune(measured: MeasuredSpec, out: Path, console: Console) -> None:
     columns, spread = unknown_to_controller(possible, study), margin_spread(possible, study)
     indexed = [name for name in columns if name.startswith("link.stiffness_factor[")]
     if indexed:  # one number for all links so far
-        whole = tuple(np.broadcast_to(study.link.stiffness_factor, 3).tolist())
+        whole = tuple(study.each_link(study.link.stiffness_factor).tolist())
         study = study.change(link__stiffness_factor=whole)
     motion = TellingMotion(study, "") if measured.keeps_motion else find_motion(study)
     if motion.text:

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from jaxmodel.pairs import Pair
-from jaxmodel.pole_paths import PoleTriplet, refine_closed_loop_poles, refine_open_loop_poles
+from jaxmodel.pole_paths import OrderPoles, refine_closed_loop_poles, refine_open_loop_poles
 from jaxmodel.return_difference import AssembledModes, LoopResponse
 from studies.engine.lanes import run_steps
 
@@ -27,6 +27,8 @@ WAYS = (
 AT_REST = 1e-4
 #: Initial distance of poles from one another and from poles of the function [1].
 ASIDE = 1e-4
+#: In which directions [rad].
+ANGLES = (0.3, 2.4, 4.4)
 
 
 def damping_ratios(
@@ -34,7 +36,7 @@ def damping_ratios(
 ) -> np.ndarray:
     """Least damping ratio of the controlled modes of each order [1], (n, n_orders).
 
-    Of the three modes of an order, only the most damped count, as many as there are controlled
+    Of the modes of an order, only the most damped count, as many as there are controlled
     links. NaN if no link is controlled, or the poles were not found.
 
     Args:
@@ -55,7 +57,7 @@ def least_controlled(ratio: np.ndarray, n_links: np.ndarray) -> np.ndarray:
     """Least damping ratio of the most damped modes, one per controlled link [1], (n,).
 
     Args:
-        ratio: of the three modes of an order [1], (3, n).
+        ratio: of the modes of an order [1], (l, n).
         n_links: controlled ones, (n,).
     """
     falling = np.sort(ratio, axis=0)[::-1]
@@ -64,12 +66,12 @@ def least_controlled(ratio: np.ndarray, n_links: np.ndarray) -> np.ndarray:
 
 
 def _poles(response: LoopResponse, modes: AssembledModes, order: int) -> np.ndarray:
-    """The three poles of an order [1/s], complex, NaN where they were not found, (3, n)."""
+    """The poles of an order [1/s], complex, NaN where they were not found, (l, n)."""
     square, decay = response.square[:, order], response.decay[:, order] / 2
     held = _pair(-decay + 1j * np.sqrt(square - decay**2))
-    which = np.argsort(-modes.share[order + 1], axis=0)[:3]
+    which = np.argsort(-modes.share[order + 1], axis=0)[: len(square)]
     omega, loss = (np.take_along_axis(x, which, axis=0) for x in (modes.omega, modes.decay))
-    first = _triplet(-loss + 1j * np.sqrt(omega**2 - loss**2), response.period)
+    first = _poles_apart(-loss + 1j * np.sqrt(omega**2 - loss**2), response.period)
     own = run_steps(_refine_open_loop_poles, (response, held), (), first, SETTLING).pole
     poles, is_found = _follow(response, own, WAYS[0])
     again = np.flatnonzero(~is_found)
@@ -80,16 +82,16 @@ def _poles(response: LoopResponse, modes: AssembledModes, order: int) -> np.ndar
 
 
 def _follow(response: LoopResponse, own: Pair, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    start = _triplet(own.re + 1j * own.im, response.period)
+    start = _poles_apart(own.re + 1j * own.im, response.period)
     last = run_steps(_refine_closed_loop_poles, (response, own), 1 / way, start, len(way))
     is_found = np.all((last.step < AT_REST) & np.isfinite(last.pole.re), axis=0)
     return last.pole.re + 1j * last.pole.im, is_found
 
 
-def _triplet(poles: np.ndarray, period: np.ndarray) -> PoleTriplet:
+def _poles_apart(poles: np.ndarray, period: np.ndarray) -> OrderPoles:
     """Initial guesses, slightly apart."""
-    poles = poles + ASIDE * np.abs(poles) * np.exp(1j * np.array([0.3, 2.4, 4.4]))[:, None]
-    return PoleTriplet(_pair(poles), _pair(np.exp(-poles * period)), np.zeros(poles.shape))
+    poles = poles + ASIDE * np.abs(poles) * np.exp(1j * np.array(ANGLES[: len(poles)]))[:, None]
+    return OrderPoles(_pair(poles), _pair(np.exp(-poles * period)), np.zeros(poles.shape))
 
 
 def _pair(x: np.ndarray) -> Pair:
@@ -97,12 +99,12 @@ def _pair(x: np.ndarray) -> Pair:
 
 
 def _refine_open_loop_poles(
-    constants: tuple[LoopResponse, Pair], _: tuple[Any, ...], triplet: PoleTriplet
-) -> PoleTriplet:
-    return refine_open_loop_poles(*constants, triplet)
+    constants: tuple[LoopResponse, Pair], _: tuple[Any, ...], traced: OrderPoles
+) -> OrderPoles:
+    return refine_open_loop_poles(*constants, traced)
 
 
 def _refine_closed_loop_poles(
-    constants: tuple[LoopResponse, Pair], inverse: Any, triplet: PoleTriplet
-) -> PoleTriplet:
-    return refine_closed_loop_poles(*constants, triplet, inverse)
+    constants: tuple[LoopResponse, Pair], inverse: Any, traced: OrderPoles
+) -> OrderPoles:
+    return refine_closed_loop_poles(*constants, traced, inverse)

@@ -224,7 +224,7 @@ def _plant_steps(
 
 
 #: Columns that `drive_rate` depends on.
-_DRIVE = ("drive.", "machine.slider_mass")
+_DRIVE = ("drive.", "machine.")
 
 
 _drive_rate = kept_jit(static_argnums=0)(drive_rate)

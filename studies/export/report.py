@@ -83,14 +83,14 @@ def _controllers(exported: FixedController, verified: Verification) -> list[list
             rows.append([name, rms, "", f"peak {peak:.4g} V, {share:.2g} % of the limit", "", ""])
             continue
         at = verified.deviation(name)
-        x, y, phi = at.pose * (1e9, 1e9, 1e6)
+        apart = at.pose * np.array([1e9, 1e9, 1e6])[: len(at.pose)]
         rows.append(
             [
                 name,
                 rms,
                 f"{100 * at.loss:+.3f} %",
                 f"differs by {at.voltage:.2e} V",
-                f"differs by {x:.2e}, {y:.2e}, {phi:.2e}",
+                f"differs by {', '.join(f'{x:.2e}' for x in apart)}",
                 "never" if at.first_code < 0 else str(at.first_code),
             ]
         )

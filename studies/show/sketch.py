@@ -54,7 +54,7 @@ def sketch(study: Study) -> Figure:
             va="center",
         )
     _path(ax, study, pose)
-    if study.load.mass:
+    if study.load.mass and len(pose) > 2:
         turn = np.array([[np.cos(pose[2]), -np.sin(pose[2])], [np.sin(pose[2]), np.cos(pose[2])]])
         center = pose[:2] + turn @ np.array(study.load.offset)
         ax.plot(*(1e3 * center), "P", color="black", markersize=6, zorder=5)

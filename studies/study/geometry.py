@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES
+from jaxmodel.table import PartError
 from studies.study.paths import field_value, own_fields
 from studies.study.spec import OWN_MECHANISMS, Study
 
@@ -36,7 +37,23 @@ def build_geometry(
         "joint_angle": joint_angle,
         "slider_mass": number("machine.slider_mass"),
     }
-    return mechanism.build(own, machine, xp)
+    geometry, near_mass = mechanism.build(own, machine, xp)
+    _check_axes(mechanism.name, geometry, [*own.values(), *machine.values()])
+    return geometry, near_mass
+
+
+def _check_axes(kind: str, geometry: Any, given: list[Any]) -> None:
+    """Raise PartError for an array that ignores the axis of cases, which would be read as one."""
+    if np.ndim(given[-1]) < 2:
+        return
+    known = {1, *(np.shape(x)[0] for x in given)}
+    for name, value in zip(geometry._fields, geometry, strict=True):
+        shape = np.shape(value)
+        if not shape or shape[0] not in known:
+            raise PartError(
+                f"mechanism {kind!r}: {name} of its geometry has shape {shape}; expected an axis "
+                "of cases first, as what it is built from has"
+            )
 
 
 def machine_geometry(study: Study) -> tuple[Any, np.ndarray]:

@@ -41,7 +41,7 @@ def check_links(study: Study) -> list[Assumption]:
     structure, case, (loop, *_) = prepared(study)
     kind = structure.basis
     integrals, signals, statics = [], [], []
-    for i in range(3):
+    for i in range(structure.n_links):
         beam, patches = _one(case.machine.beam, i), _one(case.machine.patches, i)
         beam = beam._replace(length=float(beam.length))
         sections = _sections(beam, patches, BASES[kind].has_patches)
@@ -119,7 +119,7 @@ def _frequencies(study: Study, loop: Loop, case: Case) -> Assumption:
     root = np.sqrt(
         beam.youngs_modulus * beam.stiffness_factor * beam.thickness**2 / (12 * beam.density)
     )
-    wanted = np.broadcast_to(root / beam.length**2, (3,))[:, None] * roots**2
+    wanted = np.broadcast_to(root / beam.length**2, len(omega))[:, None] * roots**2
     law = "(j pi)^2 sqrt(E I/(rhoA L^4))" if kind == "pinned_pinned" else "tan kL = tanh kL"
     return Assumption(
         assumption=f"frequencies of the links ({kind})",

@@ -103,16 +103,16 @@ def _release(study: Study) -> Assumption:
         electronics__adc_bits=32,
         electronics__adc_noise=0.0,
         drive__ripple=0.0,
-        drive__pulse_force=(0.0, 0.0, 0.0),
-        load__pulse=(0.0, 0.0, 0.0),
+        drive__pulse_force=(0.0,) * study.n_links,
+        load__pulse=(0.0,) * study.n_pose,
         motion__waypoints=study.motion.waypoints[:1],
         motion__dwell=0.0,
         motion__move_time=0.1,
         shaper__kind="none",
         metrics__residual_delay=0.0,
         metrics__residual_length=100 / electronics.sample_rate_hz,
-        initial__modal=((_SMALL,), (), ()),
-        initial__load_deflection=(0.0, 0.0, 0.0),
+        initial__modal=((_SMALL,), *((),) * (study.n_links - 1)),
+        initial__load_deflection=(0.0,) * study.n_links,
     )
     run = run_study(released, has_loop=False)
     structure, record = run.structure, run.result.record
@@ -120,17 +120,19 @@ def _release(study: Study) -> Assumption:
     matrices, sensor = jax.tree.map(
         np.asarray, _linear(structure._replace(n_steps=1, substeps=1), run.case)
     )
-    transition, modes = matrices.open + matrices.feedback, 3 * structure.n_modes
+    transition = matrices.open + matrices.feedback
+    first, modes = 2 * structure.n_pose, structure.n_links * structure.n_modes
     if np.abs(np.linalg.eigvals(transition)).max() > 1 + _GROWTH:
         return _left_out(_NAMES[1], "the loop is unstable: the run ends at limits, not its powers")
     state = np.zeros(len(transition))
-    state[6] = _SMALL  # and the filters settled on it
+    state[first] = _SMALL  # and the filters settled on it
     settled = sensor[0, :, 0] * _SMALL
-    state[6 + 2 * modes : 6 + 2 * modes + settled.size] = settled
+    after = first + 2 * modes
+    state[after : after + settled.size] = settled
     states = [state]
     for _ in range(_RELEASED - 1):
         states.append(transition @ states[-1])
-    wanted = np.array(states)[:, 6 : 6 + modes]
+    wanted = np.array(states)[:, first : first + modes]
     found = np.asarray(record.modal_coordinate).reshape(_RELEASED, modes)
     return Assumption(
         assumption=_NAMES[1],

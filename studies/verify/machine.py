@@ -12,7 +12,7 @@ from jaxmodel.beam import BASES, ModalBasis
 from jaxmodel.case import Case, Structure
 from jaxmodel.kinematics import link_direction, path_status
 from jaxmodel.loop import Loop
-from jaxmodel.parameters import Damping, Machine
+from jaxmodel.parameters import Machine
 from jaxmodel.plant import Plant, build_plant
 from studies.engine.programs import kept_jit
 from studies.reference.lagrangian import (
@@ -44,8 +44,8 @@ def _plant(has_shortening: bool, is_distributed: bool, machine: Machine, basis: 
 
 
 def _undamped(machine: Machine) -> Machine:
-    none = Damping(ratio=np.zeros((3, 1)), count=np.ones(3, int), exponent=0.0)
-    return machine._replace(damping=none)
+    none = jax.tree.map(jnp.zeros_like, machine.damping)
+    return machine._replace(damping=none._replace(count=machine.damping.count))
 
 
 def _accelerations(
@@ -64,7 +64,7 @@ def _accelerations(
         plant = jax.tree.map(np.asarray, built)
         states = _random_states(study, plant, structure.n_modes)
         found, wanted, gaps = map(np.asarray, _both(case.machine, basis, plant, states))
-        parts = slice(3), slice(3, None)
+        parts = slice(structure.n_pose), slice(structure.n_pose, None)
         pairs = [(row[p], true[p]) for row, true in zip(found, wanted, strict=True) for p in parts]
         apart[name] = worst(*(largest(row, true) for row, true in pairs))
         open_by.append(gaps)
@@ -81,7 +81,7 @@ def _accelerations(
         for name, difference in apart.items()
     ]
     closure = Assumption(
-        assumption="closure of slider, bent link and platform (6)",
+        assumption="closure of drive, bent link and platform (6)",
         against="both ways to the joints, over the link's length",
         source="Zhang, Mills and Cleghorn 2016",
         difference=worst(*open_by) / float(np.max(case.machine.beam.length)),
@@ -95,9 +95,10 @@ def _random_states(study: Study, plant: Plant, n_modes: int) -> tuple[RigidState
     length = float(np.min(study.link.length))
     points = np.array(study.motion.waypoints, float)
     poses: list[np.ndarray] = []
-    scale = 0.05 * length * np.array([1.0, 1.0, 0.0]) + np.array([0.0, 0.0, 0.05])
+    links, pose_size = study.n_links, study.n_pose
+    scale = np.array([0.05 * length, 0.05 * length, 0.05][:pose_size])
     for _ in range(50 * _STATES):
-        pose = points[len(poses) % len(points)] + scale * rng.uniform(-1, 1, 3)
+        pose = points[len(poses) % len(points)] + scale * rng.uniform(-1, 1, pose_size)
         if int(_status(plant, pose)) == 0:
             poses.append(pose)
         if len(poses) == _STATES:
@@ -106,11 +107,11 @@ def _random_states(study: Study, plant: Plant, n_modes: int) -> tuple[RigidState
     count, order = len(poses), np.arange(1, n_modes + 1)
     motion = RigidState(
         pose=np.array(poses),
-        pose_rate=rng.normal(size=(count, 3)) * [0.3, 0.3, 1.0],
-        q=0.01 * length * rng.uniform(-1, 1, (count, 3, n_modes)) / order**2,
-        q_rate=rng.normal(size=(count, 3, n_modes)) / order,
+        pose_rate=rng.normal(size=(count, pose_size)) * [0.3, 0.3, 1.0][:pose_size],
+        q=0.01 * length * rng.uniform(-1, 1, (count, links, n_modes)) / order**2,
+        q_rate=rng.normal(size=(count, links, n_modes)) / order,
     )
-    return motion, Loads(10 * rng.normal(size=(count, 3)), 3 * rng.normal(size=motion.q.shape))
+    return motion, Loads(10 * rng.normal(size=(count, links)), 3 * rng.normal(size=motion.q.shape))
 
 
 @kept_jit()
@@ -139,10 +140,10 @@ def _both(machine: Machine, basis: ModalBasis, plant: Plant, states: Any) -> Any
 def _damping(case: Case, loop: Loop) -> Assumption:
     """Ratios of the link modes as given, continued by the damping law."""
     given = jax.tree.map(np.asarray, case.machine.damping)
-    ratio, exponent = np.broadcast_to(given.ratio, (3, given.ratio.shape[-1])), given.exponent
+    ratio, exponent = given.ratio, given.exponent
     wanted = np.empty_like(loop.omega)
-    for i in range(3):
-        count = int(np.broadcast_to(given.count, (3,))[i])
+    for i in range(len(loop.omega)):
+        count = int(given.count[i])
         for j in range(loop.omega.shape[1]):
             last = min(j, count - 1)
             share = loop.omega[i, j] / loop.omega[i, last]

@@ -85,12 +85,16 @@ def _step(
         sample = sample_path(case.path, time * is_moving)
         rho, rate = inverse_kinematics(loop.plant, sample.position, sample.velocity * is_moving)
         wrench = case.load.wrench if structure.has_wrench else None
-        force = jnp.zeros(3) if has_force else None
+        force = jnp.zeros(structure.n_links) if has_force else None
         return Reference(
-            rho=rho, rho_rate=rate, feedforward=force, disturbance=jnp.zeros(3), wrench=wrench
+            rho=rho,
+            rho_rate=rate,
+            feedforward=force,
+            disturbance=jnp.zeros(structure.n_links),
+            wrench=wrench,
         )
 
-    voltage = jnp.zeros((3, structure.n_patches))
+    voltage = jnp.zeros((structure.n_links, structure.n_patches))
 
     def one_sample(state: PlantState, k: Any) -> tuple[PlantState, Stepped]:
         def one_step(part: Any, state: PlantState) -> PlantState:
@@ -108,10 +112,11 @@ def _step(
 
 
 def _at_rest(structure: Structure, case: Case, q: np.ndarray) -> PlantState:
-    zero, still = np.zeros((3, structure.n_modes)), np.zeros(3)
+    zero = np.zeros((structure.n_links, structure.n_modes))
     bent = zero.copy()
     bent[:, 0] = q
     pose = np.asarray(case.path.waypoints[0], float)
+    still = np.zeros_like(pose)
     return PlantState(pose=pose, pose_rate=still, q=bent, q_rate=zero, z=zero, z_rate=zero)
 
 
@@ -125,11 +130,11 @@ def _energy(study: Study) -> Assumption:
         drive__kind="pd",
         drive__coulomb_friction=0.0,
         drive__viscous_friction=0.0,
-        load__wrench=(0.0, 0.0, 0.0),
+        load__wrench=(0.0,) * study.n_pose,
         initial__modal=(),
     )
     structure, case = _open_loop(free)
-    bent = _BENT * float(np.min(study.link.length)) * np.array([1.0, 0.5, -1.0])
+    bent = _BENT * float(np.min(study.link.length)) * np.array([1.0, 0.5, -1.0])[: study.n_links]
     start = _at_rest(structure, case, bent)
     energy = np.asarray(_step(structure, _SAMPLES, case, 4, start, 0.0).energy)
     return Assumption(
@@ -157,7 +162,7 @@ def _steps(study: Study) -> list[Assumption]:
     n_samples = 2 ** int(np.ceil(np.log2(n_samples)))  # few programs
     parts = structure.substeps * np.array(_PARTS)
     bend = 0.0 if is_moving else _BENT * float(np.min(study.link.length))
-    start = _at_rest(structure, case, np.full(3, bend))
+    start = _at_rest(structure, case, np.full(structure.n_links, bend))
     working, *finer = [
         np.asarray(_step(structure, n_samples, case, int(n), start, 1.0).deflection)
         for n in (structure.substeps, *parts)
@@ -202,7 +207,7 @@ def _excitable(study: Study) -> Study:
         metrics__residual_delay=delay,
         drive__pulse_start=float(end_of_path(case.path)) + delay,
         drive__pulse_length=max(0.001, 2 / study.electronics.sample_rate_hz),
-        initial__modal=study.initial.modal if _is_moving(study) else ((bent,),) * 3,
+        initial__modal=study.initial.modal if _is_moving(study) else ((bent,),) * study.n_links,
     )
 
 

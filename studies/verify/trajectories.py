@@ -64,7 +64,7 @@ def _path(study: Study, case: Case) -> Assumption:
         wanted = law[:, None] * length / path.move_time[:, None, None] ** order
         wanted = wanted + (path.waypoints[:-1, None] if order == 0 else 0.0)
         if wanted.size:
-            apart.append(largest(mine, wanted.reshape(-1, 3)))
+            apart.append(largest(mine, wanted.reshape(mine.shape)))
     return Assumption(
         assumption="reference trajectory, its rates and accelerations",
         against=f"(25) move by move ({study.motion.profile})",

@@ -52,9 +52,10 @@ def build(
 ) -> tuple[FiveBarGeometry, Array]:
     """Elbows point outwards; rho = 0 where a crank points up."""
     length = own["crank_length"]
+    each = xp.ones_like(length)
     return FiveBarGeometry(
         pivot_distance=own["pivot_distance"],
         crank_length=length,
-        elbow=xp.asarray([-1.0, 1.0]),
-        zero_angle=xp.asarray([np.pi / 2, np.pi / 2]),
+        elbow=each * xp.asarray([-1.0, 1.0]),
+        zero_angle=each * np.pi / 2,
     ), own["crank_inertia"] / length**2
