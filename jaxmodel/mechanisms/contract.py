@@ -11,9 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
-import numpy as np
-
 from jaxmodel.lazy import jnp
+from jaxmodel.mechanisms.carriers import Carrier
 from jaxmodel.parameters import Array
 from jaxmodel.table import Parameter, PartError, check_parameters
 
@@ -85,12 +84,6 @@ class Legs(Protocol):
             xp: NumPy or `jax.numpy`.
         """
 
-    def carriers(self, near: np.ndarray) -> np.ndarray:
-        """Lines of what carries the near joints [m], (n, 2, 2), for a drawing; NumPy numbers.
-
-        near: places of the near joints [m], (n, 2).
-        """
-
 
 class Geometry(Protocol):
     """Numbers that describe a mechanism: a NamedTuple of arrays."""
@@ -103,6 +96,12 @@ class Geometry(Protocol):
 
     def size(self) -> float:
         """How large it is [m]; NumPy numbers."""
+
+    def carriers(self, near_mass: Array) -> tuple[Carrier, ...]:
+        """What a workshop builds to carry the near joints, leg by leg; NumPy numbers.
+
+        near_mass: what moves with B, as from `Mechanism.build` [kg], () or (n,).
+        """
 
 
 def polar(radius: Array, angle: Array, xp: Any) -> tuple[Array, Array]:

@@ -77,8 +77,9 @@ def standing(case: Case, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _carriers(ax: Axes, case: Case, near: np.ndarray) -> None:
-    for line in case.machine.geometry.legs(np).carriers(near):
-        ax.plot(*(1e3 * line.T), color="#BBBBBB", linewidth=3, zorder=0)
+    carriers = case.machine.geometry.carriers(case.machine.masses.slider_mass)
+    for carrier, joint in zip(carriers, near, strict=True):
+        ax.plot(*(1e3 * carrier.line(joint).T), color="#BBBBBB", linewidth=3, zorder=0)
 
 
 def _link(ax: Axes, study: Study, i: int, start: np.ndarray, end: np.ndarray) -> None:
