@@ -7,6 +7,7 @@ import pytest
 from jaxmodel import kinematics
 from jaxmodel.case import uncontrolled
 from jaxmodel.linear import linearise, natural_modes
+from jaxmodel.mechanisms.carriers import Rail
 from jaxmodel.prepare import prepare
 from jaxmodel.simulate import simulate
 from studies.engine.design import Design
@@ -87,6 +88,19 @@ HOLDS = {
 }
 
 
+def frequencies_of_elements(machine, pose, kp, axial_factor):
+    """Of a machine at rest on springs [Hz], ascending."""
+    rest, _ = close_chain(machine, pose)
+    model = build_model(
+        machine,
+        pose,
+        lambda i, t, rho, rate: kp * (rest[i] - rho),
+        Settings(n_elements=40, axial_factor=axial_factor),
+    )
+    square, _ = model.system.ComputeODE2Eigenvalues(computeComplexEigenvalues=False)
+    return np.sqrt(np.sort(np.abs(square))) / (2 * np.pi)
+
+
 def both_frequencies(name, hold, pose, stiffer=1.0, inertia=1.0):
     """Of the model and of finite elements [Hz]: three modes a link and, on springs, the drives'.
 
@@ -104,15 +118,8 @@ def both_frequencies(name, hold, pose, stiffer=1.0, inertia=1.0):
     ours = natural_modes(_linearise(structure, loop, pose)).frequency
     described = describe_machine(structure, case)
     carriers = (x._replace(inertia=inertia * x.inertia) for x in described.carriers)
-    rest, _ = close_chain(described, pose)
-    model = build_model(
-        described._replace(carriers=tuple(carriers)),
-        pose,
-        lambda i, t, rho, rate: kp * (rest[i] - rho),
-        Settings(n_elements=40, axial_factor=stiffer * factor),
-    )
-    square, _ = model.system.ComputeODE2Eigenvalues(computeComplexEigenvalues=False)
-    theirs = np.sqrt(np.sort(np.abs(square))) / (2 * np.pi)
+    built = described._replace(carriers=tuple(carriers))
+    theirs = frequencies_of_elements(built, pose, kp, stiffer * factor)
     n = structure.n_links
     # left out: what moves as a rigid machine, and the masses that lock carriers of our model
     first, count = {
@@ -147,6 +154,29 @@ def test_wrong_cranks_are_noticed(name):
     needs_exudyn()
     ours, theirs = both_frequencies(name, "on springs", np.array(POSES[name]), inertia=1.01)
     assert np.abs(ours / theirs - 1).max() > 1e-3
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_a_rail_may_stand_for_a_crank(name):
+    """Along the tangent of its circle: at rest it makes no difference that the path is straight."""
+    needs_exudyn()
+    pose = np.array(POSES[name])
+    machine = describe_machine(*with_unequal_links(name))
+    rho, ends = close_chain(machine, pose)
+    (crank, *others), near = machine.carriers, ends[0, 0]
+    arm = near - crank.pivot
+    along = crank.elbow * np.array([-arm[1], arm[0]]) / crank.length
+    rail = Rail(
+        start=near - rho[0] * along,
+        direction=along,
+        length=1.0,
+        mass=crank.inertia / crank.length**2,
+    )
+    mixed = machine._replace(carriers=(rail, *others))
+    for found, wanted in zip(close_chain(mixed, pose), (rho, ends), strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-14)
+    one, two = (frequencies_of_elements(x, pose, 2e4, 1.0)[:12] for x in (machine, mixed))
+    np.testing.assert_allclose(one, two, rtol=1e-5)
 
 
 # --- motion ---------------------------------------------------------------------------------------
