@@ -28,7 +28,7 @@ def response_of_elements(study, pose, signals, frequency_hz):
     """Complex responses at rest, as displacements where an accelerometer is.
 
     Args:
-        study: the machine; its sliders are held by their drives, with friction's slope at rest.
+        study: the machine; its carriers are held by their drives, with friction's slope at rest.
         pose: of the platform [m, m, rad], (3,).
         signals: inputs and outputs, n pairs.
         frequency_hz: (f,).
@@ -56,10 +56,10 @@ def _at_rest(study, pose):
     machine = describe_machine(build_structure(study), build_case(study))
     model = build_model(machine, np.array(pose), None, STIFF)
     mass, damping, stiffness, constraint = _matrices(model)
-    drive, at = study.drive, np.array(model.slider_start)
-    stiffness[at, at] += drive.kp
-    damping[at, at] += drive.kd + drive.viscous_friction
-    damping[at, at] += drive.coulomb_friction / drive.friction_speed
+    drive, at, square = study.drive, np.array(model.carrier_start), model.levers**2
+    stiffness[at, at] += drive.kp * square
+    damping[at, at] += (drive.kd + drive.viscous_friction) * square
+    damping[at, at] += drive.coulomb_friction / drive.friction_speed * square
     free = null_space(constraint)
     mass, damping, stiffness = (free.T @ x @ free for x in (mass, damping, stiffness))
     return machine, (mass, damping, stiffness, free, model)
@@ -83,14 +83,14 @@ def _matrices(model):
 
 
 def _along(model, machine, signal):
-    """What a signal measures of all coordinates, or acts on: of a motor or command its slider.
+    """What a signal measures of all coordinates, or acts on: of a motor or command its carrier.
 
     Of a patch the turning of its one end against the other, times its constant; of an accelerometer
     the motion of the node at its place.
     """
     row, i = np.zeros(len(model.reference)), signal.link
     if signal.kind in ("command", "motor", "slider"):
-        row[model.slider_start[i]] = 1.0
+        row[model.carrier_start[i]] = model.levers[i]
         return row
     if signal.kind == "accelerometer":
         node = int(np.abs(model.meshes[i].x - signal.place).argmin())

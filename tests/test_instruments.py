@@ -9,8 +9,8 @@ from studies.fitting.estimate import fit
 from studies.study.cases import build_case, build_structure
 from studies.study.signals import OUTPUTS, Signal, parse_signal, signal_name
 from studies.study.spec import paper_study
+from studies.twin.chain import close_chain
 from studies.twin.machine import describe_machine
-from studies.twin.multibody import close_chain
 from tests.fits import ACCELEROMETER, ASKEW, FREQUENCY, MOTOR, TRACE, made, spec_of, write
 
 STUDY = paper_study().change(link__modes=4)
@@ -58,7 +58,7 @@ def test_between_the_joints_a_link_adds_its_bending(bench):
     source, f = Signal("actuator", 0, 1, NONE), [20.0, 110.0, 300.0]
     machine = describe_machine(build_structure(STUDY), build_case(STUDY))
     _, ends = close_chain(machine, np.array(ASKEW))
-    axis, guide = ends[0][1] - ends[0][0], machine.guides[0].direction
+    axis, guide = ends[0][1] - ends[0][0], machine.carriers[0].direction
     normal = np.array([-axis[1], axis[0]]) / np.hypot(*axis)
     left = gain(bench, source, Signal("slider", 0, 0, NONE), f) * (normal @ guide)
     _, right = directions(bench, source, 0, END, f)

@@ -100,15 +100,14 @@ def test_constant_force_is_exact_in_one_step(omega_h):
 # --- the whole plant ------------------------------------------------------------------------------
 
 
-def wanted_motion(loop, time):
-    """Drive reference of one cycloid move (25) along y."""
+def wanted_motion(loop, home, time):
+    """Drive reference of one cycloid move (25) along y, from a pose on."""
     tau = jnp.clip(time / MOVE_TIME, 0, 1)
     y = MOVE * (tau - jnp.sin(2 * np.pi * tau) / (2 * np.pi))
     y_rate = MOVE / MOVE_TIME * (1 - jnp.cos(2 * np.pi * tau))
-    zero = jnp.zeros_like(y)
-    pose = jnp.stack([zero + HOME[0], y, zero + HOME[2]])
-    rho, rho_rate = inverse_kinematics(loop.plant, pose, jnp.stack([zero, y_rate, zero]))
-    return Reference(rho, rho_rate, None, jnp.zeros(3))
+    along = np.eye(len(home))[1]
+    rho, rho_rate = inverse_kinematics(loop.plant, home + y * along, y_rate * along)
+    return Reference(rho, rho_rate, None, jnp.zeros_like(rho))
 
 
 def derivative(structure, loop, voltage, state, wanted):
@@ -131,7 +130,7 @@ def run(method, structure, loop, sample, substeps, voltages, start):
 
         def one_step(k, state):
             time = index * sample + k * step
-            wanted = tuple(wanted_motion(loop, time + part * step) for part in (0, 0.5, 1))
+            wanted = tuple(wanted_motion(loop, start.pose, time + x * step) for x in (0, 0.5, 1))
             if method == "etdrk4":
                 return plant_step(structure, loop, state, wanted, voltage)[0]
             slope = partial(derivative, structure, loop, voltage)

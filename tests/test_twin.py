@@ -18,10 +18,11 @@ from studies.show.document import json_text, schema
 from studies.study.spec import Study
 from studies.twin import compare, report
 from studies.twin import run as twin_run
+from studies.twin.chain import close_chain
 from studies.twin.electronics import SensorFilter
 from studies.twin.machine import describe_machine
 from studies.twin.mesh import damping_matrix, held_modes, mesh_link
-from studies.twin.multibody import Settings, build_model, close_chain
+from studies.twin.multibody import Settings, build_model
 from studies.twin.plan import SignalPath
 from studies.twin.ringing import ringing_poles
 from studies.twin.run import twin_design

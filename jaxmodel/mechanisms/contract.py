@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from jaxmodel.lazy import jnp
+from jaxmodel.mechanisms.carriers import Carrier
 from jaxmodel.parameters import Array
 from jaxmodel.table import Parameter, PartError, check_parameters
 
@@ -99,12 +100,6 @@ class Legs(Protocol):
             length: of the links [m], (n,).
         """
 
-    def carriers(self, near: np.ndarray) -> np.ndarray:
-        """Lines of what carries the near joints [m], (n, 2, 2), for a drawing; NumPy numbers.
-
-        near: places of the near joints [m], (n, 2).
-        """
-
 
 class Geometry(Protocol):
     """Numbers that describe a mechanism: a NamedTuple of arrays."""
@@ -117,6 +112,12 @@ class Geometry(Protocol):
 
     def size(self) -> float:
         """How large it is [m]; NumPy numbers."""
+
+    def carriers(self, near_mass: Array) -> tuple[Carrier, ...]:
+        """What a workshop builds to carry the near joints, leg by leg; NumPy numbers.
+
+        near_mass: what moves with B, as from `Mechanism.build` [kg], () or (n,).
+        """
 
 
 #: Sine and cosine of a link's angle to its path must exceed this: it is singular otherwise [1].

@@ -44,9 +44,9 @@ def skeleton(study: Study, pose: np.ndarray, q: np.ndarray, exaggeration: float)
         np.asarray(part)
         for part in _positions(structure._replace(n_steps=1), case, pose, q, exaggeration)
     )
-    legs = case.machine.geometry.legs(np)
-    carrier = np.stack([legs.carriers(x) for x in slider])
-    return Skeleton(carrier, slider, joint, link)
+    carriers = case.machine.geometry.carriers(case.machine.masses.slider_mass)
+    lines = [[one.line(x) for one, x in zip(carriers, at, strict=True)] for at in slider]
+    return Skeleton(np.array(lines), slider, joint, link)
 
 
 @kept_jit(static_argnums=0)

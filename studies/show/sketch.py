@@ -75,8 +75,9 @@ def standing(study: Study, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _carriers(ax: Axes, study: Study, near: np.ndarray) -> None:
-    for line in machine_geometry(study)[0].legs(np).carriers(near):
-        ax.plot(*(1e3 * line.T), color="#BBBBBB", linewidth=3, zorder=0)
+    geometry, near_mass = machine_geometry(study)
+    for carrier, joint in zip(geometry.carriers(near_mass), near, strict=True):
+        ax.plot(*(1e3 * carrier.line(joint).T), color="#BBBBBB", linewidth=3, zorder=0)
 
 
 def _link(ax: Axes, study: Study, i: int, start: np.ndarray, end: np.ndarray) -> None:

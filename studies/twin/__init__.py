@@ -2,7 +2,8 @@
 
 - In: a design. Out: `TwinResult` (`result`) and its folder; `run` leads from one to the other.
 - The machine: `machine` is it as plain numbers, `mesh` its links cut into elements with their
-  damping, `multibody` builds it in Exudyn, which only this module imports.
+  damping, `chain` its joints at a pose, `multibody` builds it in Exudyn, which only this module
+  imports.
 - The loop: `plan` is what acts from outside, `electronics` the analogue chain, `law` the compiled
   controller, `reading` the signals, `loop` steps all of it.
 - The comparison: `compare` runs both models, `ringing` finds poles in signals, `margin` damping

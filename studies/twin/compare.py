@@ -9,7 +9,6 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.beam import BASES
-from jaxmodel.mechanisms.prrr import PRRR
 from studies.engine.controller import check_codable
 from studies.engine.preflight import check_run
 from studies.engine.runs import Run, run_study, uncontrolled_twin
@@ -35,9 +34,9 @@ FINE_ADC = 28
 class RunSignals(NamedTuple):
     """One run at its sampling instants."""
 
-    deflection: np.ndarray  # of mid-span from the chord [m], (N, 3)
-    pose_error: np.ndarray  # against the shaped reference trajectory [m, m, rad], (N, 3)
-    voltage: np.ndarray  # of the actuators [V], (N, 3, K)
+    deflection: np.ndarray  # of mid-span from the chord [m], (N, n)
+    pose_error: np.ndarray  # against the shaped reference trajectory [m, m, rad], (N, 3) or (N, 2)
+    voltage: np.ndarray  # of the actuators [V], (N, n, K)
 
 
 class BothModels(NamedTuple):
@@ -101,8 +100,6 @@ def check_supported(study: Study) -> None:
     if study.patches.hysteresis > 0:
         hysteresis = study.patches.hysteresis
         raise field_error("patches.hysteresis", hysteresis, "0 for studies twin", "1")
-    if study.machine.kind != PRRR.name:
-        raise field_error("machine.kind", study.machine.kind, f"{PRRR.name} for studies twin")
     if not BASES[link.basis].is_on_chord:
         names = ", ".join(name for name, one in BASES.items() if one.is_on_chord)
         raise field_error("link.basis", link.basis, f"{names} for studies twin")
@@ -213,12 +210,12 @@ def gap(both: BothModels, quantity: Callable[[RunSignals], np.ndarray], window: 
 
 
 def deflection(signals: RunSignals) -> np.ndarray:
-    """Of mid-span [m], (N, 3)."""
+    """Of mid-span [m], (N, n)."""
     return signals.deflection
 
 
 def voltage(signals: RunSignals) -> np.ndarray:
-    """Of the actuators [V], (N, 3, K)."""
+    """Of the actuators [V], (N, n, K)."""
     return signals.voltage
 
 
@@ -228,7 +225,7 @@ def place(signals: RunSignals) -> np.ndarray:
 
 
 def turn(signals: RunSignals) -> np.ndarray:
-    """Error of its angle [rad], (N, 1)."""
+    """Error of its angle [rad], (N, 1), of a body."""
     return signals.pose_error[:, 2:]
 
 

@@ -20,7 +20,7 @@ from studies.twin.multibody import DEFAULT, Model, Settings, build_model
 from studies.twin.plan import TwinPlan
 from studies.twin.reading import Reader
 
-#: Maps voltages at the ADC's input of a sample (3, K) [V] to actuator voltages of the next [V].
+#: Maps voltages at the ADC's input of a sample (n, K) [V] to actuator voltages of the next [V].
 Law = Callable[[np.ndarray], np.ndarray]
 
 #: Of Newton's method, on increments of coordinates [m, rad].
@@ -33,15 +33,15 @@ class TwinRun(NamedTuple):
     """Signals at the sampling instants."""
 
     time: np.ndarray  # [s], (N,)
-    deflection: np.ndarray  # of mid-span from the chord [m], (N, 3)
-    pose: np.ndarray  # of the platform's reference point [m, m, rad], (N, 3)
-    sensor: np.ndarray  # of the patches [V], (N, 3, K)
-    filtered: np.ndarray  # behind the anti-alias filter [V], (N, 3, K)
-    voltage: np.ndarray  # command during the sample [V], (N, 3, K)
+    deflection: np.ndarray  # of mid-span from the chord [m], (N, n)
+    pose: np.ndarray  # of the platform's reference point [m, m, rad], (N, 3) or (N, 2)
+    sensor: np.ndarray  # of the patches [V], (N, n, K)
+    filtered: np.ndarray  # behind the anti-alias filter [V], (N, n, K)
+    voltage: np.ndarray  # command during the sample [V], (N, n, K)
 
 
-class _SliderForces:
-    """Motors, friction and disturbance along the guides, see `jaxmodel.drive`."""
+class _DriveForces:
+    """Motors, friction and disturbance along the paths of the joints B, see `jaxmodel.drive`."""
 
     def __init__(self, plan: TwinPlan) -> None:
         self.is_moving = False  # False: held at the start, without disturbance
@@ -50,7 +50,8 @@ class _SliderForces:
         self._rho, self._rate, self._forward, self._jolt = (
             x.tolist() for x in (plan.rho, plan.rho_rate, plan.feedforward, _at_ends(plan))
         )
-        self._drive = [np.broadcast_to(getattr(plan.drive, name), (3,)).tolist() for name in _DRIVE]
+        count = plan.rho.shape[1]
+        self._drive = [np.broadcast_to(getattr(plan.drive, x), count).tolist() for x in _DRIVE]
 
     def __call__(self, i: int, time: float, position: float, speed: float) -> float:
         k = min(round(time / self._step), self._last) if self.is_moving else 0
@@ -66,7 +67,7 @@ _DRIVE = ("kp", "kd", "force_limit", "coulomb_friction", "friction_speed", "visc
 
 
 def _at_ends(plan: TwinPlan) -> np.ndarray:
-    """The disturbance at all instants, the mean of both where it jumps, (N n + 1, 3)."""
+    """The disturbance at all instants, the mean of both where it jumps, (instants, n)."""
     fine = np.repeat(plan.disturbance, plan.n_steps, axis=0)
     fine = np.concatenate([fine, fine[-1:]])
     jumps = slice(plan.n_steps, -1, plan.n_steps)
@@ -89,13 +90,13 @@ def run_twin(
         plan: what acts on it.
         law: the controller; None: no voltage at all.
         settings: resolution.
-        kick: voltages of the first sample [V], (3, K); default: none.
+        kick: voltages of the first sample [V], (n, K); default: none.
         is_exact: leave out the ADC's rounding, range and noise, for a loop that is linear.
 
     Raises:
         StudyError: Exudyn is missing, or its solver fails.
     """
-    force = _SliderForces(plan)
+    force = _DriveForces(plan)
     model = build_model(machine, plan.pose, force, settings)
     stepper = _Stepper(model, machine, plan, law, kick, is_exact)
     if np.any(plan.steady_wrench):
@@ -117,7 +118,7 @@ class _Stepper:
         kick: np.ndarray | None,
         is_exact: bool,
     ) -> None:
-        shape = (3, len(machine.links[0].sensor_ends))
+        shape = (len(machine.links), len(machine.links[0].sensor_ends))
         self.model, self.plan, self.law, self.is_exact = model, plan, law, is_exact
         self.reader = Reader(model, machine)
         self.filter = SensorFilter(plan.electronics, plan.step, shape)

@@ -1,7 +1,8 @@
 """The machine of a study as plain numbers, for a multibody code that knows nothing of this one.
 
-`describe_machine(structure, case)` collects what a workshop drawing would say: guides, masses,
-sections of the links piece by piece, ends and constants of the patches. No modal basis is in it.
+`describe_machine(structure, case)` collects what a workshop drawing would say: rails and cranks,
+masses, sections of the links piece by piece, ends and constants of the patches. No modal basis is
+in it.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ import numpy as np
 
 from jaxmodel.beam import BASES
 from jaxmodel.case import Case, Structure
-from jaxmodel.parameters import Beam, Damping, Patches
+from jaxmodel.mechanisms.carriers import Carrier
+from jaxmodel.parameters import Array, Beam, Damping, Machine, Patches
 from jaxmodel.piezo import actuator_constant, patch_ends, sensor_constant
 from jaxmodel.static import link_pieces, section_stiffness
 
@@ -22,7 +24,7 @@ SAME_CUT = 1e-6
 
 
 class LinkSections(NamedTuple):
-    """Constant data of the pieces of one link, (n,) each, from the slider to the platform."""
+    """Constant data of the pieces of one link, (n,) each, from B to C."""
 
     right: np.ndarray  # where a piece ends [m]
     bending: np.ndarray  # E I [N m2]
@@ -36,19 +38,11 @@ class Link(NamedTuple):
     length: float  # [m]
     sections: LinkSections
     joint_inertia: tuple[float, float]  # J_B, J_C at its ends [kg m2]
-    sensor_ends: np.ndarray  # from the slider joint [m], (K, 2)
+    sensor_ends: np.ndarray  # from joint B [m], (K, 2)
     actuator_ends: np.ndarray  # [m], (K, 2)
     sensor_constant: float  # lambda_s [V/rad]
     actuator_constant: float  # lambda_a [N m/V]
     damping: Damping  # ratios of its modes between held ends, arrays of one link: (1, n), (1,), ()
-
-
-class Guide(NamedTuple):
-    """A straight guide and the mass on it."""
-
-    start: np.ndarray  # A, where rho = 0 [m], (2,)
-    direction: np.ndarray  # u [1], (2,)
-    slider_mass: float  # [kg]
 
 
 class PlatformBody(NamedTuple):
@@ -57,16 +51,25 @@ class PlatformBody(NamedTuple):
     mass: float  # [kg]
     inertia: float  # about the centre of mass [kg m2]
     center: np.ndarray  # of mass, in the platform's axes from its reference point [m], (2,)
-    joints: np.ndarray  # C_i in the platform's axes from its reference point [m], (3, 2)
+    joints: np.ndarray  # C_i in the platform's axes from its reference point [m], (n, 2)
+
+
+class PlatformPoint(NamedTuple):
+    """A point with mass, in which all links end."""
+
+    mass: float  # [kg]
+
+
+Platform = PlatformBody | PlatformPoint
 
 
 class MachineData(NamedTuple):
-    """A whole machine."""
+    """A whole machine, leg by leg."""
 
-    guides: tuple[Guide, ...]
+    carriers: tuple[Carrier, ...]
     links: tuple[Link, ...]
-    platform: PlatformBody
-    is_locked: bool  # sliders held
+    platform: Platform
+    is_locked: bool  # drives held
 
 
 def describe_machine(structure: Structure, case: Case) -> MachineData:
@@ -78,50 +81,41 @@ def describe_machine(structure: Structure, case: Case) -> MachineData:
         structure: static choices.
         case: the numbers.
     """
-    has_patches = BASES[structure.basis].has_patches
+    machine, has_patches = case.machine, BASES[structure.basis].has_patches
     return MachineData(
-        guides=tuple(_guide(case, i) for i in range(3)),
-        links=tuple(_link(case, i, has_patches) for i in range(3)),
-        platform=_platform(case),
+        carriers=machine.geometry.carriers(machine.masses.slider_mass),
+        links=tuple(_link(machine, i, has_patches) for i in range(machine.n_links)),
+        platform=_platform(machine),
         is_locked=bool(np.any(case.drive.is_locked)),
     )
 
 
-def _each(value: object, i: int) -> float:
-    return float(np.broadcast_to(np.asarray(value), (3,))[i])
-
-
-def _guide(case: Case, i: int) -> Guide:
-    geometry = case.machine.geometry
-    side, alpha = float(np.asarray(geometry.guide_side)), _each(geometry.guide_angle, i)
-    along = np.array([np.cos(alpha), np.sin(alpha)])
-    inward = np.array([-np.sin(alpha), np.cos(alpha)])
-    distance = side / np.sqrt(12.0) + _each(geometry.guide_offset, i)
-    return Guide(
-        start=-distance * inward - side / 2 * along,
-        direction=along,
-        slider_mass=_each(case.machine.masses.slider_mass, i),
-    )
-
-
-def _platform(case: Case) -> PlatformBody:
-    masses, geometry = case.machine.masses, case.machine.geometry
+def _platform(machine: Machine) -> Platform:
+    masses, arms = machine.masses, machine.geometry.arms(np)
     own, payload = (float(np.asarray(x)) for x in (masses.platform_mass, masses.payload_mass))
+    if arms is None:
+        return PlatformPoint(own + payload)
     offset = np.zeros(2) if masses.payload_offset is None else np.asarray(masses.payload_offset)
     center = payload / (own + payload) * offset
     apart = own * payload / (own + payload) * float(offset @ offset)
     inertia = float(np.asarray(masses.platform_inertia) + np.asarray(masses.payload_inertia))
-    psi = np.array([_each(geometry.joint_angle, i) for i in range(3)])
-    radius = np.array([_each(geometry.joint_radius, i) for i in range(3)])
-    joints = radius[:, None] * np.stack([np.cos(psi), np.sin(psi)], axis=1)
-    return PlatformBody(own + payload, inertia + apart, center, joints)
+    return PlatformBody(
+        mass=own + payload,
+        inertia=inertia + apart,
+        center=center,
+        joints=np.stack(arms, axis=1),
+    )
 
 
-def _link(case: Case, i: int, has_patches: bool) -> Link:
-    beam = Beam(*(_each(x, i) for x in case.machine.beam))
-    every = case.machine.patches
-    patches = Patches(np.asarray(every.center)[i], *(_each(x, i) for x in tuple(every)[1:]))
-    damping = case.machine.damping
+def _link(machine: Machine, i: int, has_patches: bool) -> Link:
+    def own(value: Array) -> float:
+        return float(np.broadcast_to(np.asarray(value), (machine.n_links,))[i])
+
+    beam = Beam._make(map(own, machine.beam))
+    every = machine.patches._asdict()
+    center = np.asarray(every.pop("center"))[i]
+    patches = Patches(center=center, **{name: own(value) for name, value in every.items()})
+    damping = machine.damping
     return Link(
         length=beam.length,
         sections=_sections(beam, patches, has_patches),

@@ -66,7 +66,8 @@ def ring(
         duration: [s].
         pulse: on every actuator, with a sign of its own [V].
     """
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], (3, len(machine.links[0].sensor_ends)))
+    shape = (len(machine.links), len(machine.links[0].sensor_ends))
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], shape)
     at_rest = resting(plan, duration)
     with exported_law(study, factor) as law:
         return run_twin(machine, at_rest, law, settings, kick=pulse * signs, is_exact=True)

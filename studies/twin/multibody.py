@@ -1,4 +1,4 @@
-"""The machine in Exudyn: links of ANCF cables, sliders, platform, joints, patches.
+"""The machine in Exudyn: links of ANCF cables, rails, cranks, platform, joints, patches.
 
 Only this module needs Exudyn, and imports it when a model is built. Nothing of this project's
 dynamics is used: links are cables with large rotations that bend and stretch, closed to a machine
@@ -13,15 +13,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxmodel.mechanisms.carriers import Carrier, Rail
 from studies.errors import StudyError
-from studies.twin.machine import MachineData
+from studies.twin.chain import close_chain, lever, rotation
+from studies.twin.machine import MachineData, PlatformBody, PlatformPoint
 from studies.twin.mesh import Mesh, damping_matrix, mesh_link
 
 MISSING = "studies twin: Exudyn is missing: install flexlink-studies[twin]"
 
-#: Force of the motors and everything else along the guide [N] of slider i at time t [s], from rho
-#: [m] and rho' [m/s]: f(i, t, rho, rho').
-SliderForce = Callable[[int, float, float, float], float]
+#: Force of motor i and everything else along the path of joint B [N] at time t [s], from rho [m]
+#: and rho' [m/s]: f(i, t, rho, rho').
+DriveForce = Callable[[int, float, float, float], float]
 
 
 class Settings(NamedTuple):
@@ -46,12 +48,11 @@ class Model(NamedTuple):
     meshes: tuple[Mesh, ...]
     reference: np.ndarray  # reference values of all coordinates
     link_start: tuple[int, ...]  # first coordinate of each link: x, y, x', y' node by node
-    slider_start: tuple[int, ...]  # coordinate of each slider, rho minus its start
-    platform_start: int  # first of (x, y, phi)
-    rho_start: np.ndarray  # [m], (3,)
+    carrier_start: tuple[int, ...]  # coordinate of each carrier, zero at the start
+    levers: np.ndarray  # way of B over that coordinate, see `chain.lever`, (n,)
+    platform_start: int  # first of (x, y, phi), or of (x, y)
     moments: tuple[dict[int, int], ...]  # load number of each node with a patch end, by link
-    platform_loads: tuple[int, int]  # numbers of force and moment at the reference point
-    platform_center: np.ndarray  # see `machine.PlatformBody`
+    platform_loads: tuple[int, ...]  # of force and, unless it is a point, moment at its reference
 
 
 def load_exudyn() -> Any:
@@ -67,45 +68,18 @@ def load_exudyn() -> Any:
     return exudyn
 
 
-def close_chain(machine: MachineData, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Straight links of a machine at a pose.
-
-    Args:
-        machine: the machine.
-        pose: (x, y, phi) of the platform [m, m, rad], (3,).
-
-    Returns:
-        (rho [m], (3,); B and C of each link [m], (3, 2, 2)).
-    """
-    turn = _rotation(pose[2])
-    rho, ends = np.zeros(3), np.zeros((3, 2, 2))
-    for i, (guide, link) in enumerate(zip(machine.guides, machine.links, strict=True)):
-        joint = pose[:2] + turn @ machine.platform.joints[i]
-        away = joint - guide.start
-        along = guide.direction @ away
-        across = away - along * guide.direction
-        rho[i] = along - np.sqrt(link.length**2 - across @ across)
-        ends[i] = guide.start + rho[i] * guide.direction, joint
-    return rho, ends
-
-
-def _rotation(angle: float) -> np.ndarray:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s], [s, c]])
-
-
 def build_model(
     machine: MachineData,
     pose: np.ndarray,
-    force: SliderForce | None,
+    force: DriveForce | None,
     settings: Settings = DEFAULT,
 ) -> Model:
     """Assemble the machine at rest with straight links.
 
     Args:
         machine: what to build.
-        pose: of the platform [m, m, rad], (3,).
-        force: on the sliders; None: they are free.
+        pose: of the platform, (x, y, phi) or (x, y) [m, m, rad].
+        force: on the carriers; None: they are free.
         settings: resolution.
 
     Raises:
@@ -118,19 +92,20 @@ def build_model(
     system = container.AddSystem()
     rho, ends = close_chain(machine, pose)
     meshes = tuple(mesh_link(link, settings.n_elements) for link in machine.links)
-    body, platform_loads = _add_platform(system, items, machine, pose)
-    nodes, sliders, moments = [], [], []
+    levers = np.array([lever(carrier) for carrier in machine.carriers])
+    platform = _add_platform(system, items, machine, pose)
+    nodes, carriers, moments = [], [], []
     for i, mesh in enumerate(meshes):
         own = _add_link(system, items, machine, mesh, i, ends[i], settings.axial_factor)
-        slider = _add_slider(system, items, machine, i, own[0])
-        if force is not None and not machine.is_locked:
-            _add_drive(system, items, i, slider, force, rho[i])
+        carrier = _add_carrier(system, items, machine.carriers[i], ends[i, 0], own[0])
+        if machine.is_locked:
+            _hold(system, items, carrier)
+        elif force is not None:
+            _add_drive(system, items, i, carrier, force, rho[i], levers[i])
         joint = system.AddMarker(items.MarkerNodePosition(nodeNumber=own[-1]))
-        place = machine.platform.joints[i] - machine.platform.center
-        at = system.AddMarker(items.MarkerBodyPosition(bodyNumber=body, localPosition=[*place, 0]))
-        system.AddObject(items.ObjectJointRevolute2D(markerNumbers=[at, joint]))
+        system.AddObject(items.ObjectJointRevolute2D(markerNumbers=[platform.joints[i], joint]))
         nodes.append(own)
-        sliders.append(slider)
+        carriers.append(carrier)
         moments.append(_add_moments(system, items, mesh, own))
     system.Assemble()
 
@@ -144,12 +119,11 @@ def build_model(
         meshes=meshes,
         reference=_coordinates(exudyn, system, exudyn.ConfigurationType.Reference),
         link_start=tuple(start(own[0]) for own in nodes),
-        slider_start=tuple(map(start, sliders)),
-        platform_start=start(system.GetObject(body)["nodeNumber"]),
-        rho_start=rho,
+        carrier_start=tuple(map(start, carriers)),
+        levers=levers,
+        platform_start=start(platform.node),
         moments=tuple(moments),
-        platform_loads=platform_loads,
-        platform_center=machine.platform.center,
+        platform_loads=platform.loads,
     )
 
 
@@ -157,22 +131,47 @@ def _coordinates(exudyn: Any, system: Any, configuration: Any) -> np.ndarray:
     return np.array(system.systemData.GetODE2Coordinates(configuration))
 
 
-def _add_platform(
-    system: Any, items: Any, machine: MachineData, pose: np.ndarray
-) -> tuple[int, tuple[int, int]]:
-    """The rigid platform, with its node at the centre of mass: body and its two loads."""
-    platform = machine.platform
-    center = pose[:2] + _rotation(pose[2]) @ platform.center
+class _Platform(NamedTuple):
+    """A platform in Exudyn."""
+
+    node: int
+    joints: list[int]  # marker of each joint C
+    loads: tuple[int, ...]  # force, and moment unless it is a point
+
+
+def _add_platform(system: Any, items: Any, machine: MachineData, pose: np.ndarray) -> _Platform:
+    if isinstance(machine.platform, PlatformPoint):
+        return _add_point(system, items, machine.platform, pose, len(machine.links))
+    return _add_body(system, items, machine.platform, pose)
+
+
+def _add_point(
+    system: Any, items: Any, platform: PlatformPoint, pose: np.ndarray, count: int
+) -> _Platform:
+    node = system.AddNode(items.NodePoint2D(referenceCoordinates=pose))
+    system.AddObject(items.ObjectMassPoint2D(mass=platform.mass, nodeNumber=node))
+    at = system.AddMarker(items.MarkerNodePosition(nodeNumber=node))
+    force = system.AddLoad(items.LoadForceVector(markerNumber=at, loadVector=[0, 0, 0]))
+    return _Platform(node, count * [at], (force,))
+
+
+def _add_body(system: Any, items: Any, platform: PlatformBody, pose: np.ndarray) -> _Platform:
+    """The rigid platform, with its node at the centre of mass, loaded at its reference point."""
+    center = pose[:2] + rotation(pose[2]) @ platform.center
     node = system.AddNode(items.NodeRigidBody2D(referenceCoordinates=[*center, pose[2]]))
     body = system.AddObject(
         items.ObjectRigidBody2D(mass=platform.mass, inertia=platform.inertia, nodeNumber=node)
     )
+    joints = [
+        system.AddMarker(items.MarkerBodyPosition(bodyNumber=body, localPosition=[*place, 0]))
+        for place in platform.joints - platform.center
+    ]
     at = system.AddMarker(
         items.MarkerBodyRigid(bodyNumber=body, localPosition=[*-platform.center, 0])
     )
     force = system.AddLoad(items.LoadForceVector(markerNumber=at, loadVector=[0, 0, 0]))
     moment = system.AddLoad(items.LoadTorqueVector(markerNumber=at, loadVector=[0, 0, 0]))
-    return body, (force, moment)
+    return _Platform(node, joints, (force, moment))
 
 
 def _add_link(
@@ -215,63 +214,68 @@ def _add_link(
     return nodes
 
 
-def _add_slider(system: Any, items: Any, machine: MachineData, i: int, first: int) -> int:
-    """A mass with one coordinate, along which it takes the first node of its link."""
-    guide = machine.guides[i]
-    slider = system.AddNode(
-        items.NodeGenericODE2(
-            referenceCoordinates=[0.0],
-            initialCoordinates=[0.0],
-            initialCoordinates_t=[0.0],
-            numberOfODE2Coordinates=1,
+def _add_carrier(system: Any, items: Any, carrier: Carrier, near: np.ndarray, first: int) -> int:
+    """Node of a slider or a crank, with one coordinate, that carries the first node of its link.
+
+    near: B at the start [m], (2,).
+    """
+    node = system.AddNode(items.Node1D(referenceCoordinates=[0.0]))
+    if isinstance(carrier, Rail):
+        arm, axis = 0.0, carrier.direction
+        add, inertia = items.ObjectMass1D, {"mass": carrier.mass}
+    else:
+        arm, axis = carrier.length, (near - carrier.pivot) / carrier.length
+        add, inertia = items.ObjectRotationalMass1D, {"inertia": carrier.inertia}
+    axes = np.eye(3)
+    axes[:2, :2] = [[axis[0], -axis[1]], [axis[1], axis[0]]]
+    body = system.AddObject(
+        add(
+            nodeNumber=node,
+            referencePosition=[*near - arm * axis, 0.0],
+            referenceRotation=axes,
+            **inertia,
         )
     )
-    system.AddObject(
-        items.ObjectGenericODE2(nodeNumbers=[slider], massMatrix=[[guide.slider_mass]])
-    )
-    own, node = (
-        system.AddMarker(items.MarkerNodeCoordinates(nodeNumber=x)) for x in (slider, first)
-    )
-    position = np.eye(2, 4)  # of the coordinates x, y, x', y'; markers include reference values
-    start = np.array(system.GetNode(first)["referenceCoordinates"])[:2]
-    system.AddObject(
-        items.ObjectConnectorCoordinateVector(
-            markerNumbers=[own, node],
-            scalingMarker0=guide.direction[:, None],
-            scalingMarker1=position,
-            offset=start,
-        )
-    )
-    if machine.is_locked:
-        held = system.AddMarker(items.MarkerNodeCoordinate(nodeNumber=slider, coordinate=0))
-        fixed = system.AddNode(items.NodePointGround())
-        still = system.AddMarker(items.MarkerNodeCoordinate(nodeNumber=fixed, coordinate=0))
-        system.AddObject(items.ObjectConnectorCoordinate(markerNumbers=[still, held]))
-    return slider
+    at = system.AddMarker(items.MarkerBodyPosition(bodyNumber=body, localPosition=[arm, 0.0, 0.0]))
+    joint = system.AddMarker(items.MarkerNodePosition(nodeNumber=first))
+    system.AddObject(items.ObjectJointRevolute2D(markerNumbers=[at, joint]))
+    return int(node)
+
+
+def _hold(system: Any, items: Any, node: int) -> None:
+    """Keep a carrier where it is."""
+    system.AddObject(items.ObjectConnectorCoordinate(markerNumbers=_to_ground(system, items, node)))
 
 
 def _add_drive(
     system: Any,
     items: Any,
     i: int,
-    slider: int,
-    force: SliderForce,
+    node: int,
+    force: DriveForce,
     rho: float,
+    arm: float,
 ) -> None:
-    own = system.AddMarker(items.MarkerNodeCoordinate(nodeNumber=slider, coordinate=0))
-    fixed = system.AddNode(items.NodePointGround())
-    still = system.AddMarker(items.MarkerNodeCoordinate(nodeNumber=fixed, coordinate=0))
+    """The force of drive i on its carrier's coordinate u, from `rho` + `arm` u."""
 
     def resistance(
         mbs: Any, t: float, item: int, u: float, v: float, k: float, d: float, offset: float
     ) -> float:
-        return -force(i, t, rho + u, v)
+        return -arm * force(i, t, rho + arm * u, arm * v)
 
     system.AddObject(
         items.ObjectConnectorCoordinateSpringDamper(
-            markerNumbers=[still, own], springForceUserFunction=resistance
+            markerNumbers=_to_ground(system, items, node), springForceUserFunction=resistance
         )
     )
+
+
+def _to_ground(system: Any, items: Any, node: int) -> list[int]:
+    """Markers of the ground and of a carrier's coordinate."""
+    return [
+        system.AddMarker(items.MarkerNodeCoordinate(nodeNumber=x, coordinate=0))
+        for x in (system.AddNode(items.NodePointGround()), node)
+    ]
 
 
 def _add_moments(system: Any, items: Any, mesh: Mesh, nodes: list[int]) -> dict[int, int]:

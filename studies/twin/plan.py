@@ -35,18 +35,18 @@ class SignalPath(NamedTuple):
 
 
 class TwinPlan(NamedTuple):
-    """A run of N samples with n steps each, N n + 1 instants."""
+    """A run of N samples with s steps each, T = N s + 1 instants; n links, p pose coordinates."""
 
     n_samples: int
-    n_steps: int  # of the twin in a sample, n
-    pose: np.ndarray  # at the start [m, m, rad], (3,)
-    rho: np.ndarray  # reference of the sliders [m], (N n + 1, 3)
-    rho_rate: np.ndarray  # [m/s], (N n + 1, 3)
-    feedforward: np.ndarray  # of the drives [N], (N n + 1, 3)
-    disturbance: np.ndarray  # force on the sliders, held over a sample [N], (N, 3)
-    wrench: np.ndarray  # on the platform, held over a sample [N, N, N m], (N, 3)
-    steady_wrench: np.ndarray  # with which it is in equilibrium at the start, (3,)
-    noise: np.ndarray | None  # of the ADC, standard normal, (N, 3, K)
+    n_steps: int  # of the twin in a sample, s
+    pose: np.ndarray  # at the start, (x, y, phi) or (x, y) [m, m, rad], (p,)
+    rho: np.ndarray  # reference of the drives [m], (T, n)
+    rho_rate: np.ndarray  # [m/s], (T, n)
+    feedforward: np.ndarray  # of the drives [N], (T, n)
+    disturbance: np.ndarray  # force along the paths, held over a sample [N], (N, n)
+    wrench: np.ndarray  # on the platform, held over a sample [N, N, N m], (N, p)
+    steady_wrench: np.ndarray  # with which it is in equilibrium at the start, (p,)
+    noise: np.ndarray | None  # of the ADC, standard normal, (N, n, K)
     command_end: float  # when the shaped reference trajectory ends [s]
     drive: Drive  # NumPy arrays
     electronics: SignalPath
@@ -78,7 +78,7 @@ def plan_run(structure: Structure, case: Case, settings: Settings, after: float)
     inputs, outline, loop = jax.tree.map(np.asarray, (begun.inputs, begun.outline, begun.loop))
     end = float(outline.command_end)
     count = min(round((end + after) / period) + 1, structure.n_steps)
-    wrench = inputs.wrench if inputs.wrench is not None else np.zeros((count, 3))
+    wrench = inputs.wrench if inputs.wrench is not None else np.zeros((count, structure.n_pose))
     noise = inputs.adc_noise
     return TwinPlan(
         n_samples=count,
@@ -87,7 +87,7 @@ def plan_run(structure: Structure, case: Case, settings: Settings, after: float)
         rho=_instants(inputs.rho, count),
         rho_rate=_instants(inputs.rho_rate, count),
         feedforward=(
-            np.zeros((count * n_steps + 1, 3))
+            np.zeros((count * n_steps + 1, structure.n_links))
             if inputs.feedforward is None
             else _instants(inputs.feedforward, count)
         ),
@@ -105,8 +105,8 @@ _begin = kept_jit(static_argnums=0)(begin)
 
 
 def _instants(x: np.ndarray, count: int) -> np.ndarray:
-    """From the points of each sample, (N, n + 1, 3), to all instants, (count n + 1, 3)."""
-    return np.concatenate([x[:count, :-1].reshape(-1, 3), x[count - 1, -1:]])
+    """From the points of each sample, (N, s + 1, n), to all instants, (count s + 1, n)."""
+    return np.concatenate([x[:count, :-1].reshape(-1, x.shape[-1]), x[count - 1, -1:]])
 
 
 def _electronics(case: Case, controller: object) -> SignalPath:
@@ -133,14 +133,14 @@ def resting(plan: TwinPlan, duration: float) -> TwinPlan:
     """
     count = round(duration / plan.electronics.period)
     instants = count * plan.n_steps + 1
-    still = np.zeros((instants, 3))
+    still = np.zeros((instants, plan.rho.shape[1]))
     return plan._replace(
         n_samples=count,
-        rho=np.broadcast_to(plan.rho[0], (instants, 3)),
+        rho=np.broadcast_to(plan.rho[0], still.shape),
         rho_rate=still,
-        feedforward=np.broadcast_to(plan.feedforward[0], (instants, 3)),
-        disturbance=np.zeros((count, 3)),
-        wrench=np.broadcast_to(plan.steady_wrench, (count, 3)),
+        feedforward=np.broadcast_to(plan.feedforward[0], still.shape),
+        disturbance=still[:count],
+        wrench=np.broadcast_to(plan.steady_wrench, (count, len(plan.steady_wrench))),
         noise=None,
         command_end=0.0,
     )

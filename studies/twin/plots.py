@@ -33,37 +33,38 @@ def side_by_side(plan: TwinPlan, runs: BothRuns) -> Figure:
     period = plan.electronics.period
     shown = slice(max(in_window(plan).start - round(BEFORE / period), 0), plan.n_samples)
     time = 1e3 * (period * np.arange(plan.n_samples)[shown] - plan.command_end)
-    figure, axes = figures.new_figure(5, 2, row_height=1.35)
+    count = plan.rho.shape[1]
+    figure, axes = figures.new_figure(count + 2, 2, row_height=1.35)
     for column, (title, both) in enumerate(
         (("without control", runs.free), ("with control", runs.controlled))
     ):
         axes[0, column].set_title(title)
-        for i in range(3):
+        for i in range(count):
             _both(axes[i, column], time, both, lambda x, i=i: 1e6 * x.deflection[shown, i])
             axes[i, column].set_ylabel(f"link {i + 1} [µm]")
         _both(
-            axes[3, column],
+            axes[count, column],
             time,
             both,
             lambda x: 1e6 * np.linalg.norm(x.pose_error[shown, :2], axis=1),
         )
-        axes[3, column].set_ylabel("platform, error [µm]")
+        axes[count, column].set_ylabel("platform, error [µm]")
     apart = runs.controlled.theirs.deflection - runs.controlled.ours.deflection
     figures.traces(
         time,
         1e9 * apart[shown],
-        [f"link {i + 1}" for i in range(3)],
+        [f"link {i + 1}" for i in range(count)],
         "difference [nm]",
-        axes[4, 0],
+        axes[-1, 0],
     )
-    axes[4, 0].legend(loc="upper right")
-    axes[4, 0].set_title("twin minus this model, with control")
+    axes[-1, 0].legend(loc="upper right")
+    axes[-1, 0].set_title("twin minus this model, with control")
     voltage = runs.controlled.theirs.voltage[shown]
     link, patch = np.unravel_index(np.argmax(np.sum(voltage**2, axis=0)), voltage.shape[1:])
-    _both(axes[4, 1], time, runs.controlled, lambda x: x.voltage[shown, link, patch])
-    axes[4, 1].set_ylabel("voltage [V]")
-    axes[4, 1].set_title(f"actuator {link + 1}.{patch + 1}")
-    for ax in axes[4]:
+    _both(axes[-1, 1], time, runs.controlled, lambda x: x.voltage[shown, link, patch])
+    axes[-1, 1].set_ylabel("voltage [V]")
+    axes[-1, 1].set_title(f"actuator {link + 1}.{patch + 1}")
+    for ax in axes[-1]:
         ax.set_xlabel("time after the reference trajectory [ms]")
     for ax in axes.ravel():
         ax.axvline(0.0, color="#888888", linewidth=0.8, linestyle=":")

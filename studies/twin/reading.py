@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from studies.twin.machine import MachineData
+from studies.twin.chain import rotation
+from studies.twin.machine import MachineData, PlatformPoint
 from studies.twin.multibody import Model
 
 
@@ -26,12 +27,12 @@ class Reader:
         self._now = self._model.reference + data.GetODE2Coordinates()
 
     def _nodes(self, i: int) -> np.ndarray:
-        """x, y, x', y' of the nodes of a link, (n + 1, 4)."""
+        """x, y, x', y' of the nodes of a link, (nodes, 4)."""
         return self._now[self._spans[i]].reshape(-1, 4)
 
     def deflection(self) -> np.ndarray:
-        """Of mid-span from the chord between the joints, to the left of it [m], (3,)."""
-        out = np.zeros(3)
+        """Of mid-span from the chord between the joints, to the left of it [m], (n,)."""
+        out = np.zeros(len(self._model.meshes))
         for i, mesh in enumerate(self._model.meshes):
             place = self._nodes(i)[:, :2]
             chord, at = place[-1] - place[0], place[mesh.middle] - place[0]
@@ -39,7 +40,7 @@ class Reader:
         return out
 
     def voltages(self) -> np.ndarray:
-        """Of the sensors: lambda_s times the difference of the slopes at their ends [V], (3, K)."""
+        """Of the sensors: lambda_s times the difference of the slopes at their ends [V], (n, K)."""
         rows = []
         for i, (mesh, link) in enumerate(zip(self._model.meshes, self._machine.links, strict=True)):
             slope = self._nodes(i)[mesh.sensor_nodes, 2:]  # (K, 2, 2)
@@ -50,17 +51,19 @@ class Reader:
         return np.stack(rows)
 
     def pose(self) -> np.ndarray:
-        """Of the platform's reference point [m, m, rad], (3,)."""
-        start, center = self._model.platform_start, self._model.platform_center
-        x, y, phi = self._now[start : start + 3]
-        c, s = np.cos(phi), np.sin(phi)
-        return np.array([x - c * center[0] + s * center[1], y - s * center[0] - c * center[1], phi])
+        """Of the platform's reference point, (x, y, phi) or (x, y) [m, m, rad]."""
+        start, platform = self._model.platform_start, self._machine.platform
+        place = self._now[start : start + 2]
+        if isinstance(platform, PlatformPoint):
+            return np.array(place)
+        phi = self._now[start + 2]
+        return np.array([*place - rotation(phi) @ platform.center, phi])
 
     def put_voltages(self, voltage: np.ndarray) -> None:
         """Pairs of moments lambda_a V at the ends of the actuators from now on.
 
         Args:
-            voltage: [V], (3, K).
+            voltage: [V], (n, K).
         """
         for i, (mesh, link) in enumerate(zip(self._model.meshes, self._machine.links, strict=True)):
             moment = dict.fromkeys(self._model.moments[i], 0.0)
@@ -73,10 +76,11 @@ class Reader:
                 self._set(self._model.moments[i][node], [0.0, 0.0, size])
 
     def put_wrench(self, wrench: np.ndarray) -> None:
-        """Force and moment on the platform's reference point [N, N, N m], (3,)."""
-        force, moment = self._model.platform_loads
+        """Force on the platform's reference point and, unless it is a point, moment [N, N, N m]."""
+        force, *moments = self._model.platform_loads
         self._set(force, [wrench[0], wrench[1], 0.0])
-        self._set(moment, [0.0, 0.0, wrench[2]])
+        for moment in moments:
+            self._set(moment, [0.0, 0.0, wrench[2]])
 
     def _set(self, load: int, vector: list[float]) -> None:
         if self._put.get(load) != (size := tuple(vector)):

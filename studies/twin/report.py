@@ -36,7 +36,8 @@ class ComparedQuantity(NamedTuple):
 
 def compared(result: TwinResult) -> list[ComparedQuantity]:
     """Everything that is compared after the motion."""
-    links, own = ("link 1", "link 2", "link 3"), []
+    n_links, n_pose = result.plan.rho.shape[1], len(result.plan.pose)
+    links, own = tuple(f"link {i + 1}" for i in range(n_links)), []
 
     def add(
         name: str, unit: str, quantity: Callable[[Any], np.ndarray], entries: tuple[str, ...]
@@ -48,7 +49,8 @@ def compared(result: TwinResult) -> list[ComparedQuantity]:
     add("mid-span deflection", "m", deflection, links)
     add("voltage", "V", voltage, links)
     add("platform, error of place", "m", place, ("x", "y"))
-    add("platform, error of angle", "rad", turn, ("phi",))
+    if n_pose == 3:
+        add("platform, error of angle", "rad", turn, ("phi",))
     return own
 
 

@@ -27,7 +27,7 @@ class TwinResult(NamedTuple):
     runs: BothRuns
     causes: list[ChangedRun]
     loop: LoopFigures  # of our linearised sampled loop
-    first_modes: np.ndarray  # the twin's poles nearest to our first modes' [rad/s], (3,)
+    first_modes: np.ndarray  # the twin's poles nearest to our first modes' [rad/s], (n,)
     growth: GrowthMargin
 
     @property
@@ -37,7 +37,7 @@ class TwinResult(NamedTuple):
 
 
 def expected_poles(loop: LoopFigures) -> np.ndarray:
-    """Of our first modes under control [rad/s], (3,), those that oscillate."""
+    """Of our first modes under control [rad/s], (n,), those that oscillate."""
     omega, zeta = 2 * np.pi * loop.frequency_hz[0], loop.damping_ratio[0]
     omega, zeta = (x[np.isfinite(x)] for x in (omega, zeta))
     return np.asarray(omega * (-zeta + 1j * np.sqrt(1 - zeta**2)))

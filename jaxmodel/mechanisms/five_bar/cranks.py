@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxmodel.lazy import jnp
+from jaxmodel.mechanisms.carriers import Crank, cranks
 from jaxmodel.mechanisms.rrr.cranks import Cranks
 from jaxmodel.parameters import Array
 from jaxmodel.table import Parameter
@@ -26,6 +27,12 @@ class FiveBarGeometry(NamedTuple):
     def size(self) -> float:
         """From one crank's far side to the other's."""
         return 2 * float(np.max(self.pivot_distance) + np.max(self.crank_length))
+
+    def carriers(self, near_mass: Array) -> tuple[Crank, ...]:
+        """The crank on the left, and that on the right."""
+        x = np.array([-1.0, 1.0]) * np.asarray(self.pivot_distance)
+        pivots = np.stack([x, np.zeros(2)], axis=1)
+        return cranks(pivots, self.crank_length, self.zero_angle, self.elbow, near_mass)
 
     def legs(self, xp: Any = jnp) -> Cranks:
         """A_1 on the left, A_2 on the right."""

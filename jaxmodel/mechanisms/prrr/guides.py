@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxmodel.lazy import jnp
+from jaxmodel.mechanisms.carriers import Rail
 from jaxmodel.mechanisms.contract import SINGULAR_MARGIN, Near, polar, safe_root
 from jaxmodel.parameters import Array
 
@@ -53,13 +54,6 @@ class Guides(NamedTuple):
             if not SINGULAR_MARGIN <= h / own < np.sqrt(1 - SINGULAR_MARGIN**2)
         ]
 
-    def carriers(self, near: np.ndarray) -> np.ndarray:
-        """The guides, from corner to corner of the triangle."""
-        u = np.stack([self.ux, self.uy], axis=1)
-        n = np.stack([-self.uy, self.ux], axis=1)
-        middle, half = -self.h0[:, None] * n, self.s0[:, None] * u
-        return np.stack([middle - half, middle + half], axis=1)
-
 
 class GuideGeometry(NamedTuple):
     """Guides and platform joints. The paper's guides are the sides of a triangle around O."""
@@ -77,6 +71,24 @@ class GuideGeometry(NamedTuple):
     def size(self) -> float:
         """Side of the triangle."""
         return float(self.guide_side)
+
+    def carriers(self, near_mass: Array) -> tuple[Rail, ...]:
+        """The guides, from corner to corner of the triangle."""
+        angle, side = np.asarray(self.guide_angle), self.size()
+        count = angle.shape
+        offset = np.broadcast_to(np.asarray(self.guide_offset, float), count).tolist()
+        mass = np.broadcast_to(np.asarray(near_mass, float), count).tolist()
+        along = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        inward = np.stack([-along[:, 1], along[:, 0]], axis=1)
+        return tuple(
+            Rail(
+                start=-(side / np.sqrt(12.0) + offset[i]) * inward[i] - side / 2 * along[i],
+                direction=along[i],
+                length=side,
+                mass=mass[i],
+            )
+            for i in range(len(angle))
+        )
 
     def legs(self, xp: Any = jnp) -> Guides:
         """A_i = -r_i n_i - (a/2) u_i, r_i = a/(2 sqrt 3) + the guide's offset."""

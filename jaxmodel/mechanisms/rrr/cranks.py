@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxmodel.lazy import jnp
+from jaxmodel.mechanisms.carriers import Crank, cranks
 from jaxmodel.mechanisms.contract import Near, polar, safe_root
 from jaxmodel.parameters import Array
 from jaxmodel.table import Parameter
@@ -69,10 +70,6 @@ class Cranks(NamedTuple):
             if not least < far < most
         ]
 
-    def carriers(self, near: np.ndarray) -> np.ndarray:
-        """The cranks, from pivot to link."""
-        return np.stack([np.stack([self.x, self.y], axis=1), near], axis=1)
-
 
 class CrankGeometry(NamedTuple):
     """Cranks about pivots on a circle around O, and platform joints."""
@@ -92,6 +89,11 @@ class CrankGeometry(NamedTuple):
     def size(self) -> float:
         """Distance of opposite pivots."""
         return 2 * float(np.max(self.pivot_radius))
+
+    def carriers(self, near_mass: Array) -> tuple[Crank, ...]:
+        """The cranks."""
+        pivots = np.stack(polar(self.pivot_radius, self.pivot_angle, np), axis=1)
+        return cranks(pivots, self.crank_length, self.zero_angle, self.elbow, near_mass)
 
     def legs(self, xp: Any = jnp) -> Cranks:
         """A_i = r_i (cos, sin) of the pivot's direction."""

@@ -1,0 +1,74 @@
+"""What carries the near joints B, as a workshop describes it: rails and cranks.
+
+Plain numbers, for drawings and for other programs that build the machine. rho is the way of B along
+its path, as in `contract`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxmodel.parameters import Array
+
+
+class Rail(NamedTuple):
+    """A straight rail; B is on its slider, and C lies ahead of B."""
+
+    start: np.ndarray  # where rho = 0 [m], (2,)
+    direction: np.ndarray  # in which rho grows [1], (2,)
+    length: float  # [m]
+    mass: float  # of the slider [kg]
+
+    def line(self, near: np.ndarray) -> np.ndarray:
+        """Its ends [m], (2, 2), wherever B is."""
+        return np.stack([self.start, self.start + self.length * self.direction])
+
+
+class Crank(NamedTuple):
+    """A rigid crank, turned by a motor at its pivot; B is at its end."""
+
+    pivot: np.ndarray  # [m], (2,)
+    length: float  # a [m]
+    zero_angle: float  # its direction where rho = 0 [rad]
+    # 1: C lies to its left and rho grows against the clock, -1: to its right, and with the clock
+    elbow: float
+    inertia: float  # of crank and motor about the pivot [kg m2]
+
+    def line(self, near: np.ndarray) -> np.ndarray:
+        """From its pivot to B [m], (2, 2).
+
+        near: B [m], (2,).
+        """
+        return np.stack([self.pivot, near])
+
+
+Carrier = Rail | Crank
+
+
+def cranks(
+    pivots: np.ndarray, length: Array, zero_angle: Array, elbow: Array, near_mass: Array
+) -> tuple[Crank, ...]:
+    """All cranks of a mechanism; J = m a^2.
+
+    Args:
+        pivots: [m], (n, 2).
+        length: a [m], () or (n,).
+        zero_angle, elbow: see `Crank`, () or (n,).
+        near_mass: m, which turns with a crank as if it were at B [kg], () or (n,).
+    """
+    lengths, angles, elbows, masses = (
+        np.broadcast_to(np.asarray(x, float), len(pivots)).tolist()
+        for x in (length, zero_angle, elbow, near_mass)
+    )
+    return tuple(
+        Crank(
+            pivot=pivots[i],
+            length=lengths[i],
+            zero_angle=angles[i],
+            elbow=elbows[i],
+            inertia=masses[i] * lengths[i] ** 2,
+        )
+        for i in range(len(pivots))
+    )
