@@ -110,8 +110,7 @@ SCREENED: dict[str, tuple[Any, ...]] = {
 }
 
 
-LINK_AXIS = Variable(np.arange(1, 4), ("link",), "1", "link number")
-POSE_AXIS = Variable(np.array(["x", "y", "phi"]), ("pose_axis",), "1", "pose component")
+POSE = np.array(["x", "y", "phi"])
 #: For these, the smallest entry is the worst.
 LEAST = ("damping_ratio",)
 #: For these, the largest value is the best.
@@ -157,9 +156,9 @@ def axis_variables(
         sizes: length of each axis of the file.
         swept: fields that differ between its cases.
     """
-    axes = {"link": LINK_AXIS}
+    axes = {"link": Variable(np.arange(1, study.n_links + 1), ("link",), "1", "link number")}
     if "pose_axis" in sizes:
-        axes["pose_axis"] = POSE_AXIS
+        axes["pose_axis"] = Variable(POSE[: study.n_pose], ("pose_axis",), "1", "pose component")
     if "station" in sizes and "metrics.stations" not in swept:
         stations = np.array(study.metrics.stations)
         axes["station"] = Variable(stations, ("station",), "1", STATION_TEXT)

@@ -66,7 +66,9 @@ def _positions(
 
     def one(pose: Array, q: Array) -> tuple[Array, Array, Array]:
         chain = modal_chain(plant, pose, jnp.zeros_like(pose), q, jnp.zeros_like(q))
-        joint = jnp.stack(chain.far, axis=1)
+        # one joint of all links where the platform is a point
+        far = [jnp.broadcast_to(x, plant.length.shape) for x in chain.far]
+        joint = jnp.stack(far, axis=1)
         slider = joint - jnp.stack(chain.near.to_far(), axis=1)
         chord = joint - slider
         across = jnp.stack([-chord[:, 1], chord[:, 0]], axis=1) / plant.length[:, None]

@@ -167,7 +167,7 @@ def _links_to_scale(ax: Axes, study: Study) -> None:
     ax.set_xlim(0, 1e3 * longest)
     ax.set_ylim(low + gap, gap)
     ax.set_aspect("equal")
-    ax.set_yticks(ticks, ["link 1", "link 2", "link 3"])
+    ax.set_yticks(ticks, [f"link {i + 1}" for i in range(study.n_links)])
     ax.tick_params(axis="y", length=0)
     ax.grid(False)
     ax.set_xlabel("from the slider joint [mm]")

@@ -204,7 +204,7 @@ def _deflection(run: Run, twin: Run | None) -> Figure:
     window = (start, start + 1e3 * float(windows.residual_length))
     bent = [1e6 * chord_deflection(x) for x in (twin, run) if x is not None]
     has_rest = time[-1] > end
-    figure, axes = figures.new_figure(3, 1 + has_rest, 1.4)
+    figure, axes = figures.new_figure(run.study.n_links, 1 + has_rest, 1.4)
     for link, row in enumerate(axes):
         for ax in row:
             for values, style in zip(bent, _styles(run, twin), strict=True):

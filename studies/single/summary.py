@@ -26,7 +26,8 @@ def settling_text(run: Run, link: int) -> str:
 def link_rows(run: Run, twin: Run | None = None) -> Rows:
     """What each link did, at its worst station; twin: the same run without control."""
     metrics, record = run.result.metrics, run.result.record
-    columns: dict[str, Sequence[str]] = {"link": ["1", "2", "3"]}
+    numbers = [str(k + 1) for k in range(run.study.n_links)]
+    columns: dict[str, Sequence[str]] = {"link": numbers}
 
     def add(name: str, unit: str, values: np.ndarray) -> None:
         columns[headed(name, unit)] = [number(np.max(value), unit) for value in values]

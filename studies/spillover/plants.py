@@ -178,6 +178,7 @@ def plant_structure(design: FixedController, basis: str, n_modes: int) -> Struct
     """
     nominal = design.structure
     return Structure(
+        mechanism=design.structure.mechanism,
         n_modes=n_modes,
         n_controlled=nominal.n_controlled,
         n_patches=nominal.n_patches,
