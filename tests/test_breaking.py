@@ -293,7 +293,7 @@ def test_what_does_not_change_stays(design, found):
 
 
 def test_patches_stay_on_their_links_and_apart(design):
-    towards_b, towards_c = breaking._free_way(design.case)
+    towards_b, towards_c = breaking._free_way(design.structure, design.case)
     np.testing.assert_allclose(towards_b, np.tile([0.035, 0.01, 0.01], (3, 1)), atol=1e-12)
     np.testing.assert_allclose(towards_c, np.tile([0.01, 0.01, 0.035], (3, 1)), atol=1e-12)
 

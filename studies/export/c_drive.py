@@ -19,6 +19,7 @@ from jaxmodel.controller import soft_limit
 from jaxmodel.drive import Reference, drive_step
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import SliderError, resting_drive
+from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.prepare import prepare
 from studies.engine.controller import FixedController
 from studies.engine.programs import kept_jit
@@ -92,6 +93,8 @@ def drive_code(exported: FixedController, name: str, origin: list[str]) -> Drive
         "constants": [(x, array(value)) for x, value in constants.arrays.items()],
         "force": lines(force, "force"),
         "memory": lines(update, "memory") if law.update else [],
+        "n_links": structure.n_links,
+        "machine": MECHANISMS[structure.mechanism].text,
     }
     files = (render(f"export/templates/drive.{end}", **values) for end in ("h", "c"))
     return DriveCode(

@@ -51,6 +51,7 @@ def source(
         **_channel_values(channels),
         "electronics": electronics,
         "shaper": exported.study.shaper.kind,
+        "machine": exported.study.mechanism.text,
         "n_links": exported.n_links,
         "n_pose": exported.structure.n_pose,
         "n_patches": exported.n_patches,

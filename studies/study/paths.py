@@ -25,7 +25,7 @@ from jaxmodel.table import Parameter
 from studies.errors import StudyError, nearest, shown
 from studies.study.consistency import check_consistency
 from studies.study.explain import choices_of, unit_of
-from studies.study.sizes import alternatives, depth, for_mechanism, has_one_a_link
+from studies.study.sizes import alternatives, depth, has_one_a_link
 from studies.study.spec import (
     OWN_DRIVES,
     OWN_FIELDS,
@@ -244,7 +244,7 @@ def set_values(study: Study, values: Mapping[str, Any]) -> dict[str, Any]:
             whole = target[leaf] if leaf in target else field_value(study, entry.field)
             value = replaced(as_list(entry.field, whole, study.n_links), entry.indices, value)
         target[leaf] = value
-    return for_mechanism(data, Study, study.machine.kind, data["machine"]["kind"])
+    return study.with_kind(data)
 
 
 def replaced(whole: Any, indices: tuple[int, ...], value: Any) -> Any:

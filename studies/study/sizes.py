@@ -66,9 +66,8 @@ def has_one_a_link(annotation: Any) -> bool:
     )
 
 
-def mechanism_of(data: dict[str, Any]) -> Mechanism | None:
-    """The mechanism of a study that is not validated yet; None if it has none."""
-    machine = data.get("machine", {})
+def mechanism_of(machine: Any) -> Mechanism | None:
+    """The mechanism of a section that is not validated yet; None if it has none."""
     kind = machine.get("kind", PRRR.name) if isinstance(machine, dict) else None
     return MECHANISMS[kind] if isinstance(kind, str) and kind in MECHANISMS else None
 
@@ -96,25 +95,9 @@ def own_defaults(model: type[BaseModel], mechanism: Mechanism) -> dict[tuple[str
     return found
 
 
-def with_own_defaults(
-    data: dict[str, Any], model: type[BaseModel], mechanism: Mechanism
-) -> dict[str, Any]:
-    """A study's dictionary with what it does not give as its mechanism has it."""
-    data = dict(data)
-    for (section, leaf), default in own_defaults(model, mechanism).items():
-        given = data.get(section, {})
-        if isinstance(given, dict):
-            data[section] = {leaf: default} | given
-    return data
-
-
-def for_mechanism(
-    data: dict[str, Any], model: type[BaseModel], old: str, new: Any
-) -> dict[str, Any]:
-    """A whole study's dictionary for another mechanism: defaults become those of that one."""
-    if old == new or new not in MECHANISMS:
-        return data
-    before = own_defaults(model, MECHANISMS[old])
+def for_mechanism(data: dict[str, Any], model: type[BaseModel], old: Mechanism) -> dict[str, Any]:
+    """A whole study's dictionary for another mechanism, without the defaults of the old one."""
+    before = own_defaults(model, old)
     data = {name: dict(x) if isinstance(x, dict) else x for name, x in data.items()}
     for (section, leaf), default, _ in _marked(model):
         if data[section].get(leaf) == before.get((section, leaf), default):

@@ -38,7 +38,7 @@ from studies.study.sizes import (
     for_mechanism,
     lengths,
     mechanism_of,
-    with_own_defaults,
+    own_defaults,
 )
 from studies.study.state_space import with_matrices
 
@@ -656,7 +656,13 @@ class Study(Section):
                     field = name.replace("__", ".")
                     raise StudyError(f"{field}: {section} is not a section of a study")
             target[leaf] = value
-        return parse_study(for_mechanism(data, Study, self.machine.kind, data["machine"]["kind"]))
+        return parse_study(self.with_kind(data))
+
+    def with_kind(self, data: dict[str, Any]) -> dict[str, Any]:
+        """A dictionary made from this study: of another mechanism, it has defaults of that one."""
+        if data["machine"]["kind"] == self.machine.kind:
+            return data
+        return for_mechanism(data, Study, self.mechanism)
 
     @property
     def mechanism(self) -> Mechanism:
@@ -706,7 +712,7 @@ def parse_study(data: dict[str, Any]) -> Study:
 
 def explained(error: ValidationError, data: dict[str, Any]) -> StudyError:
     """The first fault that `validate` found, in words."""
-    mechanism = mechanism_of(data)
+    mechanism = mechanism_of(data.get("machine", {}))
     return explain(error, Study, data, sizes=lengths(mechanism) if mechanism else None)
 
 
@@ -716,12 +722,15 @@ def validate(data: dict[str, Any]) -> Study:
     Raises:
         ValidationError: a field that is not.
     """
-    mechanism = mechanism_of(data)
+    mechanism = mechanism_of(data.get("machine", {}))
     if mechanism is None:  # which is a fault of its own
         return Study.model_validate(data)
-    return Study.model_validate(
-        with_own_defaults(data, Study, mechanism), context=lengths(mechanism)
-    )
+    data = dict(data)
+    for (section, leaf), default in own_defaults(Study, mechanism).items():
+        given = data.get(section, {})
+        if isinstance(given, dict):
+            data[section] = {leaf: default} | given
+    return Study.model_validate(data, context=lengths(mechanism))
 
 
 def _plain(value: Any) -> Any:

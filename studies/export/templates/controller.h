@@ -1,5 +1,5 @@
 {% set kinds = "patches" if channels and channels.kind == "patch" else "modes" %}
-/* Vibration controller of a planar 3-PRR robot with flexible links.
+/* Vibration controller of a planar {{ machine }} robot with flexible links.
  *
 {% for line in origin %}
  * {{ line }}
@@ -50,6 +50,7 @@ typedef {{ NAME }}_REAL {{ name }}_real;
 {% endif %}
 
 #define {{ NAME }}_N_LINKS {{ n_links }}
+#define {{ NAME }}_N_POSE {{ n_pose }} /* coordinates of a reference */
 #define {{ NAME }}_N_PATCHES {{ n_patches }}
 #define {{ NAME }}_N_CHANNELS {{ n_links * n_patches }}
 {% if blocks %}
@@ -105,13 +106,13 @@ int {{ name }}_step({{ name }}_state *state, const {{ wire }} sensor[{{ NAME }}_
 
 /* State of the shaper: past references, newest at `newest`. */
 typedef struct {
-    {{ word }} past[{{ NAME }}_SHAPER_LENGTH][{{ n_pose }}];
+    {{ word }} past[{{ NAME }}_SHAPER_LENGTH][{{ NAME }}_N_POSE];
     uint32_t newest;
 } {{ name }}_shaper;
 
 /* Start at rest in a pose{% if not fixed %}; one that is not finite counts as zero{% endif %}. Without it, the result of
  * {{ name }}_shape_step means nothing, but stays inside the structure. */
-void {{ name }}_shape_init({{ name }}_shaper *shaper, const {{ word }} reference[{{ n_pose }}]);
+void {{ name }}_shape_init({{ name }}_shaper *shaper, const {{ word }} reference[{{ NAME }}_N_POSE]);
 
 /* One sample of the reference pose (x, y, phi): as planned in, shaped out.
 {% if fixed %}
@@ -120,8 +121,8 @@ void {{ name }}_shape_init({{ name }}_shaper *shaper, const {{ word }} reference
  * In any units. A reference with a coordinate that is not finite is replaced by the last finite one.
 {% endif %}
  */
-void {{ name }}_shape_step({{ name }}_shaper *shaper, const {{ word }} reference[{{ n_pose }}],
-    {{ word }} shaped[{{ n_pose }}]);
+void {{ name }}_shape_step({{ name }}_shaper *shaper, const {{ word }} reference[{{ NAME }}_N_POSE],
+    {{ word }} shaped[{{ NAME }}_N_POSE]);
 
 #ifdef __cplusplus
 }

@@ -1,4 +1,4 @@
-/* Drive of the sliders of a planar 3-PRR robot: {{ text }}.
+/* Drives of a planar {{ machine }} robot: {{ text }}.
  *
 {% for line in origin %}
  * {{ line }}
@@ -6,7 +6,7 @@
  *
  * Once per sample, at {{ NAME }}_RATE:
  *   1. put on the motors the feed-forward plus the feedback of the last call, limited to
- *      +-{{ NAME }}_LIMIT, and measure the sliders;
+ *      +-{{ NAME }}_LIMIT, and measure the actuated joints;
  *   2. call {{ name }}_step; its feedback goes out at the next sample.
  * That one sample of delay is part of the design. Begin with {{ name }}_init, feedback zero.
  */

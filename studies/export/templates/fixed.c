@@ -353,14 +353,14 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
     return 0;
 }
 
-void {{ name }}_shape_step({{ name }}_shaper *shaper, const int32_t reference[{{ n_pose }}], int32_t shaped[{{ n_pose }}])
+void {{ name }}_shape_step({{ name }}_shaper *shaper, const int32_t reference[{{ NAME }}_N_POSE], int32_t shaped[{{ NAME }}_N_POSE])
 {
-    int64_t sum[{{ n_pose }}] = {0};
+    int64_t sum[{{ NAME }}_N_POSE] = {0};
     uint32_t at, last;
     int k, axis;
 
     {{ shared.advance() }}
-    for (axis = 0; axis < {{ n_pose }}; axis++) {
+    for (axis = 0; axis < {{ NAME }}_N_POSE; axis++) {
         shaper->past[shaper->newest][axis] = reference[axis];
     }
     for (k = 0; k < N_TAPS; k++) {
@@ -368,11 +368,11 @@ void {{ name }}_shape_step({{ name }}_shaper *shaper, const int32_t reference[{{
         if (at >= {{ NAME }}_SHAPER_LENGTH) {
             at -= {{ NAME }}_SHAPER_LENGTH;
         }
-        for (axis = 0; axis < {{ n_pose }}; axis++) {
+        for (axis = 0; axis < {{ NAME }}_N_POSE; axis++) {
             sum[axis] += (int64_t)WEIGHT[k] * shaper->past[at][axis];
         }
     }
-    for (axis = 0; axis < {{ n_pose }}; axis++) {
+    for (axis = 0; axis < {{ NAME }}_N_POSE; axis++) {
         shaped[axis] = {{ pose }}limited({{ pose }}shifted(sum[axis], WEIGHT_SHIFT));
     }
 }

@@ -126,11 +126,11 @@ static int check({{ name }}_state *state, const real sensor[{{ NAME }}_N_CHANNEL
 }
 
 /* Whether all coordinates are finite. */
-static int is_pose(const real reference[{{ n_pose }}])
+static int is_pose(const real reference[{{ NAME }}_N_POSE])
 {
     int axis;
 
-    for (axis = 0; axis < {{ n_pose }}; axis++) {
+    for (axis = 0; axis < {{ NAME }}_N_POSE; axis++) {
         if (!(reference[axis] - reference[axis] <= 0)) {
             return 0;
         }
@@ -274,15 +274,15 @@ int {{ name }}_step({{ name }}_state *state, const real sensor[{{ NAME }}_N_CHAN
     return 0;
 }
 
-void {{ name }}_shape_step({{ name }}_shaper *shaper, const real reference[{{ n_pose }}], real shaped[{{ n_pose }}])
+void {{ name }}_shape_step({{ name }}_shaper *shaper, const real reference[{{ NAME }}_N_POSE], real shaped[{{ NAME }}_N_POSE])
 {
-    real sum[{{ n_pose }}] = {0};
+    real sum[{{ NAME }}_N_POSE] = {0};
     const int is_given = is_pose(reference);
     uint32_t at, last;
     int k, axis;
 
     {{ shared.advance() }}
-    for (axis = 0; axis < {{ n_pose }}; axis++) {
+    for (axis = 0; axis < {{ NAME }}_N_POSE; axis++) {
         shaper->past[shaper->newest][axis] = is_given ? reference[axis] : shaper->past[last][axis];
     }
     for (k = 0; k < N_TAPS; k++) {
@@ -290,11 +290,11 @@ void {{ name }}_shape_step({{ name }}_shaper *shaper, const real reference[{{ n_
         if (at >= {{ NAME }}_SHAPER_LENGTH) {
             at -= {{ NAME }}_SHAPER_LENGTH;
         }
-        for (axis = 0; axis < {{ n_pose }}; axis++) {
+        for (axis = 0; axis < {{ NAME }}_N_POSE; axis++) {
             sum[axis] += WEIGHT[k] * shaper->past[at][axis];
         }
     }
-    for (axis = 0; axis < {{ n_pose }}; axis++) {
+    for (axis = 0; axis < {{ NAME }}_N_POSE; axis++) {
         shaped[axis] = sum[axis];
     }
 }

@@ -79,13 +79,13 @@ void {{ name }}_init({{ name }}_state *state)
     state->fault = 0;
 }
 
-void {{ name }}_shape_init({{ name }}_shaper *shaper, const {{ word }} reference[{{ n_pose }}])
+void {{ name }}_shape_init({{ name }}_shaper *shaper, const {{ word }} reference[{{ NAME }}_N_POSE])
 {
     uint32_t k;
     int axis;
 
     for (k = 0; k < {{ NAME }}_SHAPER_LENGTH; k++) {
-        for (axis = 0; axis < {{ n_pose }}; axis++) {
+        for (axis = 0; axis < {{ NAME }}_N_POSE; axis++) {
             shaper->past[k][axis] = {{ reference }};
         }
     }

@@ -16,7 +16,7 @@ void timer_handler(void);
 static {{ name }}_state state;
 static {{ name }}_shaper shaper;
 static wire sensor[{{ NAME }}_N_CHANNELS], actuator[{{ NAME }}_N_CHANNELS];
-static word planned[{{ n_pose }}], shaped[{{ n_pose }}];
+static word planned[{{ NAME }}_N_POSE], shaped[{{ NAME }}_N_POSE];
 static uint32_t settling;
 
 /* For the debugger, or for whatever supervises the machine. */

@@ -28,7 +28,7 @@ void fault_handler(void);
 static {{ name }}_state state;
 static {{ name }}_shaper shaper;
 static wire sensor[MOST][{{ NAME }}_N_CHANNELS], actuator[MOST][{{ NAME }}_N_CHANNELS];
-static word reference[MOST][{{ n_pose }}], shaped[MOST][{{ n_pose }}];
+static word reference[MOST][{{ NAME }}_N_POSE], shaped[MOST][{{ NAME }}_N_POSE];
 static int32_t fault[MOST];
 static uint32_t ticks[MOST];
 
