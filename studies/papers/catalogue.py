@@ -1,0 +1,20 @@
+"""The cards, by name."""
+
+from __future__ import annotations
+
+from studies.errors import field_error, nearest
+from studies.papers.card import PaperCard
+from studies.papers.zhang_2016.card import CARD as ZHANG_2016
+
+CARDS: dict[str, PaperCard] = {card.name: card for card in (ZHANG_2016,)}
+
+
+def find_card(name: str) -> PaperCard:
+    """The card of a name.
+
+    Raises:
+        StudyError: there is none.
+    """
+    if name not in CARDS:
+        raise field_error("NAME", name, ", ".join(CARDS), hint=nearest(name, CARDS))
+    return CARDS[name]
