@@ -1,11 +1,43 @@
 """Cards of papers: their contract, the list, and what each card finds, on small batches."""
 
+import json
 import re
+from functools import partial
 
+import jsonschema
+import numpy as np
 import pytest
+import scipy
+from rich.console import Console
 
 from studies.papers.card import FAILS, HOLDS, depends_on, outcome_of
 from studies.papers.catalogue import CARDS
+from studies.papers.rrr_2016 import card as rrr_card
+from studies.papers.rrr_2016.claims import judge
+from studies.papers.rrr_2016.confirmation import confirm
+from studies.papers.rrr_2016.coupling import (
+    DEFINITIONS,
+    after_plucks,
+    coupling_ratio,
+    law,
+    ratio_of,
+)
+from studies.papers.rrr_2016.energies import (
+    ALL,
+    LINKS,
+    NONE,
+    PLUCKED,
+    SETTLED,
+    Energies,
+    free_energies,
+    propagator,
+)
+from studies.papers.rrr_2016.findings import Baseline, Effort, Kind, Sampled
+from studies.papers.rrr_2016.machines import baselines, sample, varied
+from studies.papers.rrr_2016.thresholds import DAMPING, greatest_damping, threshold
+from studies.papers.run import run_card
+from studies.show.document import schema
+from tests.pages import text_of
 from tests.test_cli import refused, run
 
 
@@ -39,3 +71,187 @@ def test_a_card_says_what_it_tests(card):
 def test_outcomes():
     assert [outcome_of(x) for x in (True, False)] == [HOLDS, FAILS]
     assert depends_on("the mass", "holds below 1 kg") == "depends on the mass: holds below 1 kg"
+
+
+# --- rrr_2016 -------------------------------------------------------------------------------------
+
+SMALL = Effort(
+    machines=256,
+    poses=3,
+    modes=(1, 2),
+    drives=3,
+    masses=3,
+    strengths=(0.05,),
+    simulated=(),
+)
+
+
+@pytest.fixture(scope="module")
+def coupled(tmp_path_factory):
+    """Folder and result of the card on few machines."""
+    folder = tmp_path_factory.mktemp("rrr")
+    small = rrr_card.CARD._replace(run=partial(rrr_card.evaluate, SMALL))
+    return folder, run_card(small, folder, Console(quiet=True))
+
+
+def test_card_writes_a_whole_folder(coupled):
+    folder, result = coupled
+    data = [*(f"{name}.csv" for name in result.tables), "claims.json"]
+    images = [*(f"{name}.png" for name in result.figures), "machine.png"]
+    assert sorted(x.name for x in folder.iterdir()) == sorted([*data, *images, "report.html"])
+    found = json.loads((folder / "claims.json").read_text(encoding="utf-8"))
+    jsonschema.validate(found, schema("paper"))
+    assert [x["text"] for x in found["claims"]] == [x.text for x in rrr_card.CARD.claims]
+    assert "depends on the coupling ratio" in found["claims"][1]["outcome"]
+    text = text_of((folder / "report.html").read_text(encoding="utf-8"))
+    assert all(x["found"] in text for x in found["claims"])
+
+
+def test_a_whole_simulation_confirms_the_linear_plant():
+    """Sampled, nonlinear, with converters: its delay costs link 1 some damping."""
+    machines = varied(
+        baselines()["3-RRR"],
+        link_mass=np.array([20.0]),
+        platform_mass=np.array([0.2]),
+        near_mass=np.array([0.1]),
+        drive_ratio=np.array([0.4]),
+        damping=np.array([0.005]),
+        added=np.array([0.05]),
+        stiffness=np.array([[1.0, 1.01, 0.99]]),
+        poses=np.array([[0.01, 0.02, 0.1]]),
+    )
+    found = confirm(machines, 0, lambda *_: None)
+    assert found.linear_ratio > 0.3
+    assert found.simulated_ratio == pytest.approx(found.linear_ratio, rel=0.01)
+    np.testing.assert_allclose(found.simulated[1:], found.linear[1:], atol=0.01)
+    assert found.linear[1:].max() > 0.05
+    assert 0.8 * found.linear[0] < found.simulated[0] < found.linear[0]
+
+
+def test_one_mode_per_link_is_enough(coupled):
+    rows = np.array([row[1:] for row in coupled[1].tables["modes"].rows], float)
+    np.testing.assert_allclose(rows[::2, 1:], rows[1::2, 1:], rtol=0.01)
+
+
+@pytest.fixture(scope="module", params=["3-PRR", "3-RRR"])
+def free(request):
+    """A few machines of a sample, and their energies."""
+    machines = sample(baselines()[request.param], 32, seed=1)
+    return machines, free_energies(machines.study, machines.columns, machines.poses, 1)
+
+
+def test_energies_are_those_of_lyapunov_s_equation(free):
+    """SciPy's solver, case by case; the pluck of link 2 seen at link 1 and at the platform."""
+    _, energies = free
+    rows = np.flatnonzero(energies.is_feasible)
+    assert len(rows) > 16
+    for k in rows[:8]:
+        for mask in (NONE, ALL):
+            state = energies.state[k, mask]
+            start = np.eye(len(state))[7]
+            scale = scale_of(energies)  # for the solver
+            scaled = state * scale / scale[:, None]
+            for place, output in ((0, np.eye(1, len(state), 6)), (3, np.eye(2, len(state)))):
+                whole = scipy.linalg.solve_continuous_lyapunov(scaled.T, -output.T @ output)
+                value = energies.value[k, mask, place, 1]
+                np.testing.assert_allclose(value, start @ whole @ start, rtol=1e-6)
+
+
+def test_propagators_of_stiff_drives(free):
+    """SciPy's exponential, which does not limit its squarings."""
+    _, energies = free
+    size = np.abs(energies.state[:, NONE]).max(axis=(1, 2)) * energies.is_feasible
+    state = energies.state[int(np.argmax(size)), NONE]
+    scale = scale_of(energies)
+    found = (
+        np.asarray(propagator(state, SETTLED, 3, energies.omega.mean())) * scale / scale[:, None]
+    )
+    wanted = scipy.linalg.expm(SETTLED * state * scale / scale[:, None])
+    np.testing.assert_allclose(found, wanted, atol=1e-8 * np.abs(wanted).max())
+
+
+def scale_of(energies):
+    """Sizes of the states (X, X', q, q') of one mode per link."""
+    return np.repeat([1.0, energies.omega.mean(), 1.0, energies.omega.mean()], 3)
+
+
+def test_links_on_locked_drives_are_on_their_own():
+    """However light the platform: joints that stand still pass nothing on."""
+    study = baselines()["3-RRR"]
+    ratios = []
+    for drive_ratio in (1.5, 300.0):
+        machines = varied(
+            study,
+            link_mass=np.array([10.0]),
+            platform_mass=np.array([0.05]),
+            near_mass=np.array([0.1]),
+            drive_ratio=np.array([drive_ratio]),
+            damping=np.array([0.005]),
+            added=np.array([0.1]),
+            stiffness=np.ones((1, 3)),
+            poses=np.array([[0.01, 0.01, 0.05]]),
+        )
+        energies = free_energies(machines.study, machines.columns, machines.poses, 1)
+        ratios.append(float(coupling_ratio(energies)[0]))
+    assert ratios[1] < 1e-3 < 0.1 < ratios[0]
+
+
+def test_reductions_of_two_links_that_share_their_energy():
+    """The law by hand: energies 1 in the plucked link, rho^2 in another, control takes those."""
+    value = np.full((1, 5, 5, 6), 0.25)
+    value[0, NONE, LINKS, PLUCKED] = 0.25 + 0.75 * np.eye(3)
+    for i in range(3):  # with link i controlled nothing comes through it
+        value[0, 1 + i] = value[0, NONE]
+        value[0, 1 + i, :, i] = 0.0
+    energies = Energies(np.array([True]), value, np.zeros((1, 5, 1, 1)), np.ones((1, 3)))
+    assert coupling_ratio(energies)[0] == pytest.approx(0.5)
+    assert after_plucks(energies)[0] == pytest.approx(1 - np.sqrt(1.25 / 1.5))
+    assert law(0.5) == pytest.approx(1 - 1 / np.sqrt(1.25))
+    assert law(ratio_of(0.1)) == pytest.approx(0.1)
+
+
+def test_threshold_of_a_known_cloud():
+    """Reductions ratio +- 0.05, uniform: quantiles at 0.1 are crossed where ratio is 0.1 -+."""
+    rng = np.random.default_rng(3)
+    ratio = rng.uniform(0, 0.3, 20_000)
+    found = threshold(ratio, ratio + rng.uniform(-0.05, 0.05, ratio.size), 0.1)
+    assert found.low == pytest.approx(0.055, abs=0.01)
+    assert found.middle == pytest.approx(0.1, abs=0.01)
+    assert found.high == pytest.approx(0.145, abs=0.01)
+    assert 0 < found.error < 0.005
+    never = threshold(ratio, 0 * ratio, 0.1)
+    assert np.isnan([never.low, never.middle, never.high]).all()
+
+
+def test_greatest_damping_of_a_known_function():
+    factor = np.array([1.0, 4.0, 1e-6, 1e6, np.nan])
+    found = greatest_damping(lambda zeta: 1e-3 * factor / zeta, 0.1, len(factor))
+    np.testing.assert_allclose(found[:2], [0.01, 0.04], rtol=0.01)
+    assert found[2] == 0 and found[3] == DAMPING[1] and np.isnan(found[4])
+
+
+def test_a_claim_without_exceptions_holds_or_fails(coupled):
+    """The outcome follows the numbers: no machine calmed, or all of them."""
+    kinds = {}
+    for name, study in baselines().items():
+        kinds[name] = kind_of(study, 0.0)
+    assert judge(kinds)[1].outcome == HOLDS and judge(kinds)[3].outcome == FAILS
+    for name, study in baselines().items():
+        kinds[name] = kind_of(study, 0.5)
+    assert judge(kinds)[1].outcome == FAILS and judge(kinds)[3].outcome == HOLDS
+
+
+def kind_of(study, reduction):
+    """A kind of which all machines have one reduction."""
+    ones = np.ones(4)
+    base = Baseline(
+        ratio=ones,
+        others=reduction * ones,
+        itself=ones,
+        every=ones,
+        platform=0.1 * np.ones((4, 2)),
+        converged=np.ones((1, 2)),
+    )
+    found = dict.fromkeys(DEFINITIONS, reduction * ones)
+    sampled = Sampled(machines=None, row=None, ratio=ones, reduction=found, thresholds={})
+    return Kind(study=study, baseline=base, sampled=sampled, strong=None, best=None, confirmed=[])

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from studies.errors import field_error, nearest
 from studies.papers.card import PaperCard
+from studies.papers.rrr_2016.card import CARD as RRR_2016
 from studies.papers.zhang_2016.card import CARD as ZHANG_2016
 
-CARDS: dict[str, PaperCard] = {card.name: card for card in (ZHANG_2016,)}
+CARDS: dict[str, PaperCard] = {card.name: card for card in (ZHANG_2016, RRR_2016)}
 
 
 def find_card(name: str) -> PaperCard:
