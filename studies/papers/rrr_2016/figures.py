@@ -14,7 +14,7 @@ from studies.papers.rrr_2016.coupling import DEFINITIONS, law
 from studies.papers.rrr_2016.findings import LEVELS, Kind
 from studies.papers.rrr_2016.machines import OMEGA
 from studies.papers.rrr_2016.maps import LINK_MASS, NEAR_MASS, PLATFORM_MASS, DampingMap
-from studies.papers.rrr_2016.thresholds import DAMPING, moving_quantiles
+from studies.papers.rrr_2016.thresholds import DAMPING, QUANTILES, moving_quantile
 from studies.show import figures
 
 DOTS, BAND = "#BBBBBB", figures.SERIES[0]
@@ -27,7 +27,8 @@ def coupling(kinds: dict[str, Kind]) -> Figure:
         sampled = kind.sampled
         reduction = 100 * sampled.reduction[DECIDING]
         ax.plot(sampled.ratio, reduction, ".", color=DOTS, markersize=1.5, label="machines")
-        at, (top, middle, low) = moving_quantiles(sampled.ratio, reduction)
+        curves = [moving_quantile(sampled.ratio, reduction, q) for q in QUANTILES]
+        (at, top), (_, middle), (_, low) = curves
         ax.fill_between(at, low, top, color=BAND, alpha=0.2, linewidth=0, label="90 % of them")
         ax.plot(at, middle, color=BAND, label="half of them")
         ratio = np.linspace(0, sampled.ratio.max(), 100)

@@ -11,6 +11,7 @@ import numpy as np
 WINDOW = 0.05
 #: Share of machines for which the ends of an interval speak [1].
 CONFIDENCE = 0.95
+QUANTILES = (CONFIDENCE, 0.5, 1 - CONFIDENCE)
 #: Samples drawn from the sample for the standard error of a threshold.
 RESAMPLED = 40
 
@@ -35,7 +36,7 @@ def threshold(ratio: np.ndarray, reduction: np.ndarray, level: float) -> Thresho
     """
     is_known = np.isfinite(reduction)
     ratio, reduction = ratio[is_known], reduction[is_known]
-    low, middle, high = (_crossing(ratio, reduction, level, q) for q in _QUANTILES)
+    low, middle, high = (_crossing(ratio, reduction, level, q) for q in QUANTILES)
     rng = np.random.default_rng(0)
     again = [
         _crossing(ratio[rows], reduction[rows], level, 0.5)
@@ -46,22 +47,21 @@ def threshold(ratio: np.ndarray, reduction: np.ndarray, level: float) -> Thresho
     return Threshold(reduction=level, low=low, middle=middle, high=high, error=error)
 
 
-_QUANTILES = (CONFIDENCE, 0.5, 1 - CONFIDENCE)
-
-
-def moving_quantiles(ratio: np.ndarray, reduction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coupling ratios in ascending order (m,), and quantiles of the reduction there, (3, m)."""
+def moving_quantile(
+    ratio: np.ndarray, reduction: np.ndarray, quantile: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Coupling ratios in ascending order, and a quantile of the reduction there, (m,) each."""
     order = np.argsort(ratio)
     size = max(int(WINDOW * len(ratio)), 9)
     windows = np.lib.stride_tricks.sliding_window_view(reduction[order], size)
     middle = np.lib.stride_tricks.sliding_window_view(ratio[order], size)
-    return np.median(middle, axis=1), np.quantile(windows, _QUANTILES, axis=1)
+    return np.median(middle, axis=1), np.quantile(windows, quantile, axis=1)
 
 
 def _crossing(ratio: np.ndarray, reduction: np.ndarray, level: float, quantile: float) -> float:
     """Where a moving quantile of the reduction passes a level for the last time."""
-    at, curves = moving_quantiles(ratio, reduction)
-    is_below = curves[_QUANTILES.index(quantile)] < level
+    at, curve = moving_quantile(ratio, reduction, quantile)
+    is_below = curve < level
     if is_below.all() or not is_below.any():
         return np.nan
     last = int(np.flatnonzero(is_below)[-1])
