@@ -243,6 +243,16 @@ def test_threshold_of_a_known_cloud():
     assert np.isnan([never.low, never.middle, never.high]).all()
 
 
+def test_the_low_end_of_a_threshold_is_where_it_is_first_passed():
+    """A hump of high reductions at small ratios: no machines below the low end pass the level."""
+    ratio = np.linspace(0, 1, 4096)
+    reduction = np.where((ratio > 0.2) & (ratio < 0.4), 0.15, 0.05)
+    reduction = np.where(ratio > 0.7, 0.2, reduction)
+    found = threshold(ratio, reduction, 0.1)
+    assert found.low == pytest.approx(0.2, abs=0.03)
+    assert found.middle == pytest.approx(0.7, abs=0.03)
+
+
 def test_greatest_damping_of_a_known_function():
     factor = np.array([1.0, 4.0, 1e-6, 1e6, np.nan])
     found = greatest_damping(lambda zeta: 1e-3 * factor / zeta, 0.1, len(factor))

@@ -59,11 +59,16 @@ def moving_quantile(
 
 
 def _crossing(ratio: np.ndarray, reduction: np.ndarray, level: float, quantile: float) -> float:
-    """Where a moving quantile of the reduction passes a level for the last time."""
+    """Where a moving quantile passes a level: the upper ones for the first time, others for good.
+
+    So below the low end of an interval no machines of any ratio exceed the level more often.
+    """
     at, curve = moving_quantile(ratio, reduction, quantile)
     is_below = curve < level
     if is_below.all() or not is_below.any():
         return np.nan
+    if quantile > 0.5:
+        return float(at[np.argmin(is_below)])
     last = int(np.flatnonzero(is_below)[-1])
     return float(at[last]) if last + 1 < len(at) else np.nan
 
