@@ -16,7 +16,7 @@ help:  ## this list
 install: .venv/installed  ## set up the environment .venv, nothing else
 
 study: .venv/installed  ## run the study of the paper and a sweep of patch placements
-	$(BIN)/studies paper --out results/paper
+	$(BIN)/studies paper zhang_2016 --out results/paper
 	rm -rf results/placement
 	$(BIN)/studies sweep placement --out results/placement --report
 	$(BIN)/studies best results/placement --by residual_rms --subject-to "gain_margin > 2" --count 5

@@ -20,7 +20,7 @@ from .fitting.estimate import fit
 from .fitting.run import run_fit
 from .fitting.spec import load_fit
 from .laws.run import run_laws
-from .paper.run import run_paper
+from .papers.run import run_paper
 from .show.document import schema
 from .single.plant import controller_of, plant_of, write_system
 from .single.run import replay, simulate

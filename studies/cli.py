@@ -27,7 +27,7 @@ from studies.errors import OWN_WARNINGS, StudyError, printable
 from studies.export.commands import add_commands as add_export
 from studies.fitting.commands import add_commands as add_fit
 from studies.laws.commands import add_commands as add_laws
-from studies.paper.commands import add_commands as add_paper
+from studies.papers.commands import add_commands as add_paper
 from studies.show import document
 from studies.show.document import AsJson, print_document
 from studies.single.commands import add_commands as add_single

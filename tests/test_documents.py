@@ -25,7 +25,7 @@ from tests.test_cli import SHORT, refused, run
 from tests.test_sweep_tables import DAMPING, GAINS, MARGINS, RMS, VOLTS, designed, usual
 
 #: Commands whose documents are files in their folder.
-WRITERS = {"commission", "comparison", "fit", "laws", "spillover"}
+WRITERS = {"commission", "comparison", "fit", "laws", "paper", "spillover"}
 SWEEP = """
 [sweep]
 where = "gain < 0.9"

@@ -98,7 +98,7 @@ def test_a_template_becomes_a_whole_page(fill_report):
     assert '<div class="table">\n<table>' in html and '<meta charset="utf-8">' in html
 
 
-REPORTS = {x.parent.name: x for x in sorted(Path(studies.__file__).parent.glob("*/report.html"))}
+REPORTS = {x.parent.name: x for x in sorted(Path(studies.__file__).parent.glob("**/report.html"))}
 
 
 @pytest.mark.parametrize("name", REPORTS)

@@ -1,10 +1,13 @@
 """The paper's study end to end on a short run, and the tables and numbers it reports."""
 
+import csv
 import io
+import json
 import re
 from pathlib import Path
 from typing import NamedTuple
 
+import jsonschema
 import numpy as np
 import pytest
 import xarray
@@ -17,17 +20,21 @@ from studies.engine.preflight import check_run
 from studies.engine.runs import run_study
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
-from studies.paper import cases as paper_cases
-from studies.paper import context as report_context
-from studies.paper import figures as paper_figures
-from studies.paper import report, tables
-from studies.paper import run as paper
-from studies.paper.cases import ALL, MOVES, OFF, ONE, SHAPERS, TWO, run_cases
-from studies.paper.context import Context, Machines
-from studies.paper.measures import measure
+from studies.papers import run as papers
+from studies.papers.zhang_2016 import card as paper
+from studies.papers.zhang_2016 import cases as paper_cases
+from studies.papers.zhang_2016 import context as report_context
+from studies.papers.zhang_2016 import figures as paper_figures
+from studies.papers.zhang_2016 import report, tables
+from studies.papers.zhang_2016.cases import ALL, MOVES, OFF, ONE, SHAPERS, TWO, run_cases
+from studies.papers.zhang_2016.claims import CLAIMS, LEFT_OPEN
+from studies.papers.zhang_2016.context import Context, Machines
+from studies.papers.zhang_2016.measures import measure
+from studies.show.document import schema
 from studies.show.figures import comparison
 from studies.show.units import span
 from studies.store import read_store
+from studies.study.labels import describe
 from studies.study.printed import TABLE_1
 from studies.study.spec import paper_study
 from tests.pages import text_of
@@ -72,35 +79,50 @@ class Short(NamedTuple):
 def short(tmp_path_factory):
     folder = tmp_path_factory.mktemp("paper")
     cases = [case for case in paper_cases.paper_cases() if case.name not in LONG]
-    kept = []
-
-    def run(*arguments):
-        kept.append(run_cases(*arguments))
-        return kept[-1]
-
     console = Console(record=True, width=120, file=io.StringIO())
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper_cases, "JUDGED", ())
-        patch.setattr(paper, "run_cases", run)
         few = {name: paper_figures.PAPER_FIGURES[name] for name in FIGURES}
         patch.setattr(paper, "PAPER_FIGURES", few)
         patch.setattr(report, "PAPER_FIGURES", few)
-        paper.write_paper(folder, console, other_machine(), short_study(), cases)
-    names = ("fitted machine", "nominal machine")
-    contexts = (Context(n, runs, measure(runs)) for n, runs in zip(names, kept, strict=True))
-    return Short(folder, Machines(*contexts), console.export_text())
+        machines = paper.evaluate(other_machine(), short_study(), cases, lambda *_: None)
+        papers.run_card(card_of(machines), folder, console)
+    return Short(folder, machines, console.export_text())
+
+
+def card_of(machines):
+    """The card with runs that are there already."""
+    return paper.CARD._replace(run=lambda _: paper.result_of(machines))
 
 
 def test_folder_holds_whole_files_and_nothing_else(short):
     names = sorted(file.name for file in short.folder.iterdir())
     figures = [f"{name}.png" for name in FIGURES]
-    assert names == sorted([*figures, "machine.png", "fitted.h5", "nominal.h5", "report.html"])
+    data = ["fitted.h5", "nominal.h5", "comparison.csv", "runs.csv", "claims.json"]
+    assert names == sorted([*figures, *data, "machine.png", "report.html"])
     assert (short.folder / "fig03.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
-def test_status_of_every_case_is_printed(short):
-    for case in short.runs.cases:
-        assert case.name in short.printed
+def test_status_of_every_case_is_written(short):
+    with (short.folder / "runs.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    named = [(row["machine"], row["case"], row["status"]) for row in rows]
+    assert named == [
+        (context.name, case.name, describe(int(code)))
+        for context in short.machines
+        for case, code in zip(context.runs.cases, context.runs.status, strict=True)
+    ]
+
+
+def test_outcome_of_every_claim_is_printed_and_kept(short):
+    found = json.loads((short.folder / "claims.json").read_text(encoding="utf-8"))
+    jsonschema.validate(found, schema("paper"))
+    assert [claim["text"] for claim in found["claims"]] == [x.text for x in CLAIMS]
+    assert {claim["outcome"] for claim in found["claims"]} == {"holds", "fails"}
+    page = text_of((short.folder / "report.html").read_text(encoding="utf-8"))
+    for claim in found["claims"]:
+        assert claim["found"] in page
+    assert found["left_open"] == list(LEFT_OPEN) and all(one in page for one in LEFT_OPEN)
     assert "report.html" in short.printed and "fitted.h5" in short.printed
 
 
@@ -316,7 +338,7 @@ def test_refuses_a_bad_folder_before_any_work(tmp_path, capsys, place):
     file.write_text("mine")
     target = file if place == "file" else file / "below"
     with pytest.raises(SystemExit) as stop:
-        main(["paper", "--out", str(target)])
+        main(["paper", "zhang_2016", "--out", str(target)])
     assert stop.value.code == 2
     message = capsys.readouterr().err
     assert message.count("\n") == 1 and "--out" in message and "folder" in message
@@ -330,12 +352,9 @@ def test_failure_while_writing_leaves_old_files_whole(short, tmp_path, monkeypat
     def fail(*_):
         raise OSError("disk full")
 
-    runs = iter(context.runs for context in short.machines)
-    monkeypatch.setattr(paper, "run_cases", lambda *_: next(runs))
-    monkeypatch.setattr(paper, "draw_figure", fail)
+    monkeypatch.setattr(papers, "save", fail)
     with pytest.raises(StudyError, match="disk full"):
-        studies = (context.runs.study for context in short.machines)
-        paper.write_paper(tmp_path, Console(quiet=True), *studies, short.runs.cases)
+        papers.run_card(card_of(short.machines), tmp_path, Console(quiet=True))
     assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
     assert (tmp_path / "report.html").read_text() == "old"
 

@@ -12,8 +12,15 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from studies.paper.cases import ALL, COMPARED, EXPERIMENT_RATIOS, MOVES, OFF, PAPER_RATIOS
-from studies.paper.context import PLACES, Context, Machines, change, residual, residuals
+from studies.papers.zhang_2016.cases import (
+    ALL,
+    COMPARED,
+    EXPERIMENT_RATIOS,
+    MOVES,
+    OFF,
+    PAPER_RATIOS,
+)
+from studies.papers.zhang_2016.context import PLACES, Context, Machines, change, residual, residuals
 from studies.show.units import count_text
 from studies.study.labels import describe
 from studies.study.margin import margin_text

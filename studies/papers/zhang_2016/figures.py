@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -19,8 +18,8 @@ from matplotlib.figure import Figure
 
 from jaxmodel import shaper
 from studies.engine.programs import kept_jit
-from studies.paper.cases import ALL, OFF, ONE, TWO, PaperRuns
-from studies.paper.context import Machines
+from studies.papers.zhang_2016.cases import ALL, OFF, ONE, TWO, PaperRuns
+from studies.papers.zhang_2016.context import Machines
 from studies.show import figures
 
 #: Length of the views after the move [s].
@@ -47,12 +46,6 @@ class Row(NamedTuple):
     signals: Callable[[PaperRuns], np.ndarray]  # (n, T, rows)
     place: int  # of the row's signal among these
     delay: float | None = LINKS_DELAY  # of the view after the move [s]; None: whole motion
-
-
-def draw_figure(name: str, machines: Machines, folder: Path, has_pdf: bool) -> None:
-    """Write one of PAPER_FIGURES into a folder."""
-    with figures.styled():
-        figures.save(PAPER_FIGURES[name](machines), folder, name, has_pdf)
 
 
 def _responses(machines: Machines, rows: list[Row], links: tuple[bool, ...], modes: int) -> Figure:

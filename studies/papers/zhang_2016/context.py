@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from studies.paper.cases import ALL, COMPARED, MOVES, OFF, ONE, SHAPERS, TWO, PaperRuns
-from studies.paper.measures import Measures
+from studies.papers.zhang_2016.cases import ALL, COMPARED, MOVES, OFF, ONE, SHAPERS, TWO, PaperRuns
+from studies.papers.zhang_2016.measures import Measures
 
 #: Cases of a comparison: controlled links and heading.
 PLACES = ((ALL, "three links"), (TWO, "first two"), (ONE, "first only"))

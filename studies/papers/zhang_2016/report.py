@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from jaxmodel.prepare import SPECTRUM_SPAN
-from studies.paper.cases import (
+from studies.papers.card import PaperCard, Verdict
+from studies.papers.zhang_2016.cases import (
     ALL,
     EXPERIMENT_RATIOS,
     HIGH_DAMPING,
@@ -20,10 +21,10 @@ from studies.paper.cases import (
     PAPER_RATIOS,
     TWO,
 )
-from studies.paper.context import Context, Machines, change
-from studies.paper.figures import PAPER_FIGURES, PLATFORM_DELAY, VIEW_LENGTH
-from studies.paper.measures import SETTLED
-from studies.paper.tables import (
+from studies.papers.zhang_2016.context import Context, Machines, change
+from studies.papers.zhang_2016.figures import PAPER_FIGURES, PLATFORM_DELAY, VIEW_LENGTH
+from studies.papers.zhang_2016.measures import SETTLED
+from studies.papers.zhang_2016.tables import (
     COLUMNS,
     amplitude_change,
     design_rows,
@@ -42,10 +43,14 @@ from studies.show.sketch import CAPTION
 from studies.study.window import residual_delay
 
 
-def report(machines: Machines, images: Path | None = None) -> str:
+def report(
+    card: PaperCard, verdicts: list[Verdict], machines: Machines, images: Path | None = None
+) -> str:
     """The page of the paper's study.
 
     Args:
+        card: of the paper.
+        verdicts: on its claims.
         machines: both.
         images: folder with its figures, PAPER_FIGURES; None: a page without.
     """
@@ -53,9 +58,11 @@ def report(machines: Machines, images: Path | None = None) -> str:
     runs, study = nominal.runs, nominal.runs.study
     cases = {case.name: k for k, case in enumerate(runs.cases)}
     return page(
-        "paper/report.html",
+        "papers/zhang_2016/report.html",
         images,
         study,
+        card=card,
+        verdicts=verdicts,
         fitted=fitted.runs.study,
         study=study,
         machines=machine_rows(machines),

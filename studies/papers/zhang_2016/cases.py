@@ -3,7 +3,8 @@
 First pass: no control. Its modal energies give the controlled cases of section 4 the ratios (24) of
 their own uncontrolled counterparts, as in the paper; section 5 takes the ratios that it prints.
 Second pass: the controlled cases. They differ only in numbers, so one program, compiled once for a
-fixed number of cases, runs all cases of a machine.
+fixed number of cases, runs all cases of a machine: XLA's scan, since a kernel would take longer to
+trace than the scan takes for these few cases (docs/performance.md).
 """
 
 from __future__ import annotations
@@ -28,11 +29,6 @@ from studies.engine.runs import judged_status, run_study
 from studies.engine.stability import LoopFigures, loop_report
 from studies.study.files import READY
 from studies.study.spec import Study, load_study
-
-#: Executor. A kernel would take longer to trace than the scan takes for these few cases
-#: (docs/performance.md).
-EXECUTOR = "XLA scan, with trajectories"
-
 
 #: The paper's move and a faster one that leaves vibration to suppress [s].
 MOVES = {"paper": 0.1, "fast": 0.04}

@@ -1,131 +1,17 @@
-"""`studies paper`: the paper's sections 4 and 5 with one command, in one folder.
-
-Two machines stand beside the paper's numbers: the one fitted to its measurements, and the nominal
-one. The folder gets a file of runs for each, the counterparts of the paper's figures, and the
-report.
-"""
+"""What the file of a machine's runs holds."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Column, Table
 
-from studies.engine.batches import ProgressCallback
 from studies.engine.columns import axis_variables
-from studies.engine.run_data import metric_variables, run_attributes
-from studies.paper.cases import (
-    EXECUTOR,
-    MOVES,
-    PaperCase,
-    PaperRuns,
-    fitted_study,
-    paper_cases,
-    run_cases,
-    work_of,
-)
-from studies.paper.context import Context, Machines
-from studies.paper.figures import PAPER_FIGURES, draw_figure
-from studies.paper.measures import Measures, measure, middle_station
-from studies.paper.report import report
-from studies.publish import REPORT, announce, check_folder, publish
-from studies.show.figures import styled, write_figure
-from studies.show.sketch import sketch
-from studies.store import Variable, axis_sizes, write_store
+from studies.engine.run_data import metric_variables
+from studies.papers.zhang_2016.cases import MOVES, PaperRuns
+from studies.papers.zhang_2016.measures import Measures, middle_station
+from studies.store import Variable, axis_sizes
 from studies.study.labels import STATUS_LABEL, describe
-from studies.study.spec import Study, paper_study
-
-#: File of a machine's runs, by its field in `Machines`.
-DATA = {name: f"{name}.h5" for name in Machines._fields}
-
-
-def run_paper(out: str | Path, console: Console | None = None, has_pdf: bool = False) -> None:
-    """Run the paper's study and write data, figures and report.
-
-    Args:
-        out: folder, created if missing; files of an earlier run are replaced.
-        console: where progress and the outcome go; default: standard output.
-        has_pdf: also write the figures as PDF.
-
-    Raises:
-        StudyError: the folder cannot be made or written to.
-    """
-    console = console or Console(highlight=False, markup=False)
-    write_paper(Path(out), console, fitted_study(), paper_study(), paper_cases(), has_pdf)
-
-
-def write_paper(
-    out: Path,
-    console: Console,
-    fitted: Study,
-    nominal: Study,
-    cases: list[PaperCase],
-    has_pdf: bool = False,
-) -> None:
-    """`run_paper` for chosen machines and choice of cases.
-
-    Args:
-        out: folder.
-        console: where progress and the outcome go.
-        fitted: the machine of the measurements, which runs the compared cases.
-        nominal: the machine that runs all cases.
-        cases: from `paper_cases`.
-        has_pdf: also write the figures as PDF.
-
-    Raises:
-        StudyError: as `run_paper` and `run_cases`.
-    """
-    check_folder(out)
-    columns = (TextColumn("{task.description:<44}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console) as progress:
-        compared = [case for case in cases if case.is_compared]
-        work = work_of(compared) + work_of(cases) + 1 + len(PAPER_FIGURES) / 4
-        task = progress.add_task("starting", total=work)
-
-        def on_progress(text: str, share: float) -> None:
-            progress.update(task, description=text, advance=share)
-
-        machines = Machines(
-            _context("fitted machine", run_cases(fitted, compared, on_progress)),
-            _context("nominal machine", run_cases(nominal, cases, on_progress)),
-        )
-        _write(out, machines, on_progress, has_pdf)
-        progress.update(task, description="done", completed=work)
-    _print_outcome(out, console, machines)
-
-
-def _context(name: str, runs: PaperRuns) -> Context:
-    return Context(name, runs, measure(runs))
-
-
-def _write(out: Path, machines: Machines, on_progress: ProgressCallback, has_pdf: bool) -> None:
-    with publish(out) as staging:
-        on_progress("writing data", 0.0)
-        for file, context in zip(DATA.values(), machines, strict=True):
-            variables = paper_variables(context.runs, context.measures)
-            write_store(staging / file, variables, run_attributes(context.runs.study))
-        on_progress("writing data", 1.0)
-        for name in PAPER_FIGURES:
-            on_progress(f"drawing {name}", 0.25)
-            draw_figure(name, machines, staging, has_pdf)
-        study = machines.nominal.runs.study
-        with styled():
-            write_figure(sketch(study), staging / "machine.png")
-        (staging / REPORT).write_text(report(machines, staging), encoding="utf-8")
-
-
-def _print_outcome(out: Path, console: Console, machines: Machines) -> None:
-    table = Table("machine", Column("case", no_wrap=True), "links", "modes", "status")
-    for name, context in zip(Machines._fields, machines, strict=True):
-        for case, code in zip(context.runs.cases, context.runs.status, strict=True):
-            table.add_row(name, case.name, case.links_text, str(case.modes), describe(int(code)))
-    console.print(table)
-    console.print(f"executor: {EXECUTOR}")
-    announce(console, out / REPORT, f"; data: {', '.join(DATA.values())} in the same folder")
 
 
 def paper_variables(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from studies.paper.cases import PaperRuns
+from studies.papers.zhang_2016.cases import PaperRuns
 
 #: Spectra are kept up to this frequency [Hz].
 TOP_HZ = 1200.0

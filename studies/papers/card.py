@@ -1,0 +1,81 @@
+"""What a card of a paper is: claims with conditions, a study that tests them, open numbers.
+
+A claim's condition is a comparison of a number that the study measures, so that the outcome follows
+from the run and from nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from matplotlib.figure import Figure
+
+from studies.engine.batches import ProgressCallback
+from studies.show.listing import Rows
+from studies.store import Variable
+from studies.study.spec import Study
+
+HOLDS, FAILS = "holds", "fails"
+
+
+class Claim(NamedTuple):
+    """One statement of a paper, in our words, and what decides it."""
+
+    text: str
+    quantity: str  # what is measured, with its unit
+    condition: str  # on that quantity
+
+
+class Verdict(NamedTuple):
+    """Outcome of a claim: `HOLDS`, `FAILS`, or what it depends on (`depends_on`)."""
+
+    claim: Claim
+    outcome: str
+    found: str  # the numbers that decide
+
+    @property
+    def cells(self) -> list[str]:
+        """A row of the table of claims."""
+        return [*self.claim, self.outcome, self.found]
+
+
+def outcome_of(is_met: bool) -> str:
+    """`HOLDS` or `FAILS`."""
+    return HOLDS if is_met else FAILS
+
+
+def depends_on(quantity: str, condition: str) -> str:
+    """Outcome of a claim that is true for some machines only.
+
+    Args:
+        quantity: that decides.
+        condition: where the claim holds, with numbers: "holds below 0.3, fails above 0.7".
+    """
+    return f"depends on {quantity}: {condition}"
+
+
+class CardResult(NamedTuple):
+    """What the study of a card found, and how it is written."""
+
+    study: Study  # baseline
+    verdicts: list[Verdict]  # of the card's claims, in their order
+    tables: dict[str, Rows]  # by name of their CSV file
+    figures: dict[str, Callable[[], Figure]]  # by file name, of which the page shows all
+    page: Callable[[Path], str]  # report, from the folder of the figures
+    # runs by name of their HDF5 file: their study and variables
+    stores: Mapping[str, tuple[Study, dict[str, Variable]]] = {}
+
+
+class PaperCard(NamedTuple):
+    """A paper and the study that tests it."""
+
+    name: str  # first author and year
+    title: str
+    source: str  # where it appeared, with its DOI
+    read: str  # what of it could be read
+    claims: tuple[Claim, ...]
+    left_open: tuple[str, ...]  # numbers that a reader would need and the paper does not give
+    work: float  # sum of the shares that `run` reports
+    run: Callable[[ProgressCallback], CardResult]

@@ -1,0 +1,25 @@
+"""The cards, by name."""
+
+from __future__ import annotations
+
+from studies.errors import field_error, nearest
+from studies.papers.card import PaperCard
+from studies.papers.geronel_2025.card import CARD as GERONEL_2025
+from studies.papers.gupta_2010.card import CARD as GUPTA_2010
+from studies.papers.rrr_2016.card import CARD as RRR_2016
+from studies.papers.zhang_2016.card import CARD as ZHANG_2016
+
+CARDS: dict[str, PaperCard] = {
+    card.name: card for card in (ZHANG_2016, RRR_2016, GUPTA_2010, GERONEL_2025)
+}
+
+
+def find_card(name: str) -> PaperCard:
+    """The card of a name.
+
+    Raises:
+        StudyError: there is none.
+    """
+    if name not in CARDS:
+        raise field_error("NAME", name, ", ".join(CARDS), hint=nearest(name, CARDS))
+    return CARDS[name]
