@@ -26,6 +26,8 @@ from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import DriveLaw
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law
+from jaxmodel.mechanisms import MECHANISMS
+from jaxmodel.mechanisms.contract import Mechanism
 from jaxmodel.metrics import METRICS, Metric
 from jaxmodel.table import PartError, Table
 from studies import sources
@@ -35,7 +37,7 @@ from studies.space.methods import METHODS, Method
 from studies.study.labels import RESERVED
 
 #: Lists that a file of one's own can have.
-KINDS = ("laws", "drives", "metrics", "methods", "targets")
+KINDS = ("laws", "drives", "mechanisms", "metrics", "methods", "targets")
 #: Where child processes find what was loaded, as paths or module names.
 VARIABLE = "FLEXLINK_WITH"
 
@@ -44,16 +46,17 @@ def extend(
     module: str | Path = "",
     laws: Iterable[Law] = (),
     drives: Iterable[DriveLaw] = (),
+    mechanisms: Iterable[Mechanism] = (),
     metrics: Iterable[Metric] = (),
     methods: Iterable[Method] = (),
     targets: Iterable[Any] = (),
 ) -> None:
-    """Load laws, drives, metrics, methods and targets; loading them again changes nothing.
+    """Load parts of one's own; loading them again changes nothing.
 
     Args:
-        module: Python file (`*.py`) or importable module with lists `laws`, `drives`, `metrics`,
-            `methods` (of sweeps), `targets` (of exports); "" for none.
-        laws, drives, metrics, methods, targets: further ones.
+        module: Python file (`*.py`) or importable module with lists `laws`, `drives`,
+            `mechanisms`, `metrics`, `methods` (of sweeps), `targets` (of exports); "" for none.
+        laws, drives, mechanisms, metrics, methods, targets: further ones.
 
     Raises:
         StudyError: no such module, one that fails or is empty, or a name already taken.
@@ -63,6 +66,7 @@ def extend(
     for kind, added in (
         ("laws", laws),
         ("drives", drives),
+        ("mechanisms", mechanisms),
         ("metrics", metrics),
         ("methods", methods),
         ("targets", targets),
@@ -136,6 +140,7 @@ def _table(kind: str) -> Table[Any]:
     tables: dict[str, Table[Any]] = {
         "laws": LAWS,
         "drives": DRIVES,
+        "mechanisms": MECHANISMS,
         "metrics": METRICS,
         "methods": METHODS,
     }

@@ -75,6 +75,7 @@ def test_calls_and_their_options_exist():
         "comparison",
         "fit",
         "laws",
+        "paper",
         "spillover",
         "bench",
     }

@@ -78,10 +78,9 @@ def test_kinetic_energy_equals_quadrature_over_the_link(kind, states):
     def points(pose, q):
         """Points of the links in the plane, their sliders, (3, points, 2) and (3, 2)."""
         rho, beta = reference.close(MACHINE, basis, pose, q)
-        corner, u, _ = reference.guides(MACHINE.geometry)
         along = jnp.stack([jnp.cos(beta), jnp.sin(beta)], axis=1)[:, None]
         across = jnp.stack([-jnp.sin(beta), jnp.cos(beta)], axis=1)[:, None]
-        slider = corner + rho[:, None] * u
+        slider = reference.near_joints(MACHINE.geometry, rho)
         return slider[:, None] + x[:, None] * along + (q @ shape.T)[:, :, None] * across, slider
 
     @jax.jit

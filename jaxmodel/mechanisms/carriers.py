@@ -6,7 +6,7 @@ its path, as in `contract`.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,10 +16,10 @@ from jaxmodel.parameters import Array
 class Rail(NamedTuple):
     """A straight rail; B is on its slider, and C lies ahead of B."""
 
-    start: np.ndarray  # where rho = 0 [m], (2,)
-    direction: np.ndarray  # in which rho grows [1], (2,)
-    length: float  # [m]
-    mass: float  # of the slider [kg]
+    start: Array  # where rho = 0 [m], (2,)
+    direction: Array  # in which rho grows [1], (2,)
+    length: Array  # [m]
+    mass: Array  # of the slider [kg]
 
     def line(self, near: np.ndarray) -> np.ndarray:
         """Its ends [m], (2, 2), wherever B is."""
@@ -29,12 +29,12 @@ class Rail(NamedTuple):
 class Crank(NamedTuple):
     """A rigid crank, turned by a motor at its pivot; B is at its end."""
 
-    pivot: np.ndarray  # [m], (2,)
-    length: float  # a [m]
-    zero_angle: float  # its direction where rho = 0 [rad]
+    pivot: Array  # [m], (2,)
+    length: Array  # a [m]
+    zero_angle: Array  # its direction where rho = 0 [rad]
     # 1: C lies to its left and rho grows against the clock, -1: to its right, and with the clock
-    elbow: float
-    inertia: float  # of crank and motor about the pivot [kg m2]
+    elbow: Array
+    inertia: Array  # of crank and motor about the pivot [kg m2]
 
     def line(self, near: np.ndarray) -> np.ndarray:
         """From its pivot to B [m], (2, 2).
@@ -48,7 +48,7 @@ Carrier = Rail | Crank
 
 
 def cranks(
-    pivots: np.ndarray, length: Array, zero_angle: Array, elbow: Array, near_mass: Array
+    pivots: Array, length: Array, zero_angle: Array, elbow: Array, near_mass: Array, xp: Any
 ) -> tuple[Crank, ...]:
     """All cranks of a mechanism; J = m a^2.
 
@@ -57,9 +57,10 @@ def cranks(
         length: a [m], () or (n,).
         zero_angle, elbow: see `Crank`, () or (n,).
         near_mass: m, which turns with a crank as if it were at B [kg], () or (n,).
+        xp: NumPy or `jax.numpy`.
     """
     lengths, angles, elbows, masses = (
-        np.broadcast_to(np.asarray(x, float), len(pivots)).tolist()
+        xp.broadcast_to(xp.asarray(x, float), len(pivots))
         for x in (length, zero_angle, elbow, near_mass)
     )
     return tuple(

@@ -113,10 +113,12 @@ class Geometry(Protocol):
     def size(self) -> float:
         """How large it is [m]; NumPy numbers."""
 
-    def carriers(self, near_mass: Array) -> tuple[Carrier, ...]:
-        """What a workshop builds to carry the near joints, leg by leg; NumPy numbers.
+    def carriers(self, near_mass: Array, xp: Any = np) -> tuple[Carrier, ...]:
+        """What a workshop builds to carry the near joints, leg by leg.
 
-        near_mass: what moves with B, as from `Mechanism.build` [kg], () or (n,).
+        Args:
+            near_mass: what moves with B, as from `Mechanism.build` [kg], () or (n,).
+            xp: NumPy or `jax.numpy`.
         """
 
 

@@ -11,13 +11,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxmodel.beam import ModalBasis
 from jaxmodel.dynamics import Accelerations, accelerations, modal_chain
 from jaxmodel.kinematics import Chain
-from jaxmodel.mechanisms.five_bar import cranks as five_bar
-from jaxmodel.mechanisms.prrr import guides as prrr
+from jaxmodel.mechanisms.carriers import Carrier, Rail
 from jaxmodel.parameters import Machine
 from jaxmodel.plant import Plant
 
@@ -38,57 +36,45 @@ class Loads(NamedTuple):
     modal: Any  # on the modal coordinates [N], (3, R)
 
 
-def guides(geometry: prrr.GuideGeometry) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Starting corners A_i [m], directions u_i and inward normals n_i, (3, 2) each."""
-    angle = geometry.guide_angle
-    u = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
-    n = jnp.stack([-jnp.sin(angle), jnp.cos(angle)], axis=1)
-    away = geometry.guide_side / (2 * np.sqrt(3.0)) + jnp.broadcast_to(geometry.guide_offset, (3,))
-    return -away[:, None] * n - geometry.guide_side / 2 * u, u, n
-
-
-def pivots(geometry: Any) -> jax.Array:
-    """A_i of the cranks [m], (n, 2)."""
-    if isinstance(geometry, five_bar.FiveBarGeometry):
-        return jnp.array([[-1.0, 0.0], [1.0, 0.0]]) * geometry.pivot_distance
-    angle = geometry.pivot_angle
-    return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1) * jnp.reshape(
-        geometry.pivot_radius, (-1, 1)
-    )
-
-
 def near_joints(geometry: Any, rho: Any) -> Any:
-    """Joints B_i [m] by the actuated coordinates, (n, 2)."""
-    if isinstance(geometry, prrr.GuideGeometry):
-        corner, u, _ = guides(geometry)
-        return corner + rho[:, None] * u
-    theta = geometry.zero_angle + geometry.elbow * rho / geometry.crank_length
-    crank = jnp.stack([jnp.cos(theta), jnp.sin(theta)], axis=1)
-    return pivots(geometry) + jnp.reshape(geometry.crank_length, (-1, 1)) * crank
+    """Joints B_i [m] by the actuated coordinates, (n, 2): along rails, or turned by cranks."""
+
+    def joint(carrier: Carrier, rho: Any) -> Any:
+        if isinstance(carrier, Rail):
+            return carrier.start + rho * carrier.direction
+        theta = carrier.zero_angle + carrier.elbow * rho / carrier.length
+        return carrier.pivot + carrier.length * jnp.stack([jnp.cos(theta), jnp.sin(theta)])
+
+    carriers = geometry.carriers(0.0, jnp)
+    return jnp.stack([joint(carrier, x) for carrier, x in zip(carriers, rho, strict=True)])
 
 
 def reach(geometry: Any, joints: Any, distance: Any) -> Any:
     """Actuated coordinates that put B_i at a distance from C_i [m], (n,)."""
-    if isinstance(geometry, prrr.GuideGeometry):
-        corner, u, n = guides(geometry)
-        to_joint = joints - corner
-        slant = jnp.arcsin(jnp.sum(to_joint * n, axis=1) / distance)
-        return jnp.sum(to_joint * u, axis=1) - distance * jnp.cos(slant)
-    far, a = joints - pivots(geometry), geometry.crank_length
-    square = jnp.sum(far**2, axis=1)
-    between = jnp.arccos((square + a**2 - distance**2) / (2 * a * jnp.sqrt(square)))
-    theta = jnp.arctan2(far[:, 1], far[:, 0]) - geometry.elbow * between
-    turn = theta - geometry.zero_angle
-    return geometry.elbow * a * jnp.arctan2(jnp.sin(turn), jnp.cos(turn))
+
+    def coordinate(carrier: Carrier, joint: Any, distance: Any) -> Any:
+        if isinstance(carrier, Rail):
+            (x, y), far = carrier.direction, joint - carrier.start
+            slant = jnp.arcsin((x * far[1] - y * far[0]) / distance)
+            return x * far[0] + y * far[1] - distance * jnp.cos(slant)
+        far, a = joint - carrier.pivot, carrier.length
+        square = jnp.sum(far**2)
+        between = jnp.arccos((square + a**2 - distance**2) / (2 * a * jnp.sqrt(square)))
+        turn = jnp.arctan2(far[1], far[0]) - carrier.elbow * between - carrier.zero_angle
+        return carrier.elbow * a * jnp.arctan2(jnp.sin(turn), jnp.cos(turn))
+
+    legs = zip(geometry.carriers(0.0, jnp), joints, distance, strict=True)
+    return jnp.stack([coordinate(*leg) for leg in legs])
 
 
 def platform_joints(geometry: Any, pose: jax.Array) -> jax.Array:
     """Joints C_i [m] of the platform, (n, 2)."""
-    if isinstance(geometry, five_bar.FiveBarGeometry):
-        return jnp.stack([pose, pose])
-    angle = geometry.joint_angle + pose[2]
-    radius = jnp.broadcast_to(geometry.joint_radius, (3,))
-    return pose[:2] + radius[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+    arms = geometry.arms()
+    if arms is None:
+        return jnp.stack([pose] * len(pose))  # as many links meet in it
+    arm = jnp.stack(arms, axis=1)
+    turned = jnp.stack([-arm[:, 1], arm[:, 0]], axis=1)
+    return pose[:2] + jnp.cos(pose[2]) * arm + jnp.sin(pose[2]) * turned
 
 
 def payload_energy(masses: Any, pose: jax.Array, pose_rate: jax.Array) -> Any:

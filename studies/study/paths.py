@@ -22,7 +22,7 @@ from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.mechanisms.contract import Mechanism
 from jaxmodel.mechanisms.prrr import PRRR
 from jaxmodel.table import Parameter
-from studies.errors import StudyError, nearest, shown
+from studies.errors import StudyError, field_error, nearest, shown
 from studies.study.consistency import check_consistency
 from studies.study.explain import choices_of, unit_of
 from studies.study.sizes import alternatives, depth, has_one_a_link
@@ -270,6 +270,9 @@ def checked_value(study: Study, name: str, value: Any, path: str) -> Any:
         raise StudyError(f"{path}: {explained(error, data)}") from None
     except StudyError as error:
         raise StudyError(f"{path}: {error}") from None
+    if (changed.n_links, changed.n_pose) != (study.n_links, study.n_pose):
+        alike = [x.name for x in MECHANISMS.values() if x.n_links == study.n_links]
+        raise field_error(path, value, f"machines of as many links: {', '.join(alike)}")
     return known_field(name, changed)
 
 

@@ -28,11 +28,11 @@ class FiveBarGeometry(NamedTuple):
         """From one crank's far side to the other's."""
         return 2 * float(np.max(self.pivot_distance) + np.max(self.crank_length))
 
-    def carriers(self, near_mass: Array) -> tuple[Crank, ...]:
+    def carriers(self, near_mass: Array, xp: Any = np) -> tuple[Crank, ...]:
         """The crank on the left, and that on the right."""
-        x = np.array([-1.0, 1.0]) * np.asarray(self.pivot_distance)
-        pivots = np.stack([x, np.zeros(2)], axis=1)
-        return cranks(pivots, self.crank_length, self.zero_angle, self.elbow, near_mass)
+        x = xp.asarray([-1.0, 1.0]) * xp.asarray(self.pivot_distance)
+        pivots = xp.stack([x, xp.zeros(2)], axis=1)
+        return cranks(pivots, self.crank_length, self.zero_angle, self.elbow, near_mass, xp)
 
     def legs(self, xp: Any = jnp) -> Cranks:
         """A_1 on the left, A_2 on the right."""

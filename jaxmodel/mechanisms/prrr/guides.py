@@ -72,14 +72,15 @@ class GuideGeometry(NamedTuple):
         """Side of the triangle."""
         return float(self.guide_side)
 
-    def carriers(self, near_mass: Array) -> tuple[Rail, ...]:
+    def carriers(self, near_mass: Array, xp: Any = np) -> tuple[Rail, ...]:
         """The guides, from corner to corner of the triangle."""
-        angle, side = np.asarray(self.guide_angle), self.size()
-        count = angle.shape
-        offset = np.broadcast_to(np.asarray(self.guide_offset, float), count).tolist()
-        mass = np.broadcast_to(np.asarray(near_mass, float), count).tolist()
-        along = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        inward = np.stack([-along[:, 1], along[:, 0]], axis=1)
+        angle, side = xp.asarray(self.guide_angle), xp.asarray(self.guide_side)
+        offset, mass = (
+            xp.broadcast_to(xp.asarray(x, float), angle.shape)
+            for x in (self.guide_offset, near_mass)
+        )
+        along = xp.stack([xp.cos(angle), xp.sin(angle)], axis=1)
+        inward = xp.stack([-along[:, 1], along[:, 0]], axis=1)
         return tuple(
             Rail(
                 start=-(side / np.sqrt(12.0) + offset[i]) * inward[i] - side / 2 * along[i],

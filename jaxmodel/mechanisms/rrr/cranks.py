@@ -90,10 +90,10 @@ class CrankGeometry(NamedTuple):
         """Distance of opposite pivots."""
         return 2 * float(np.max(self.pivot_radius))
 
-    def carriers(self, near_mass: Array) -> tuple[Crank, ...]:
+    def carriers(self, near_mass: Array, xp: Any = np) -> tuple[Crank, ...]:
         """The cranks."""
-        pivots = np.stack(polar(self.pivot_radius, self.pivot_angle, np), axis=1)
-        return cranks(pivots, self.crank_length, self.zero_angle, self.elbow, near_mass)
+        pivots = xp.stack(polar(self.pivot_radius, self.pivot_angle, xp), axis=1)
+        return cranks(pivots, self.crank_length, self.zero_angle, self.elbow, near_mass, xp)
 
     def legs(self, xp: Any = jnp) -> Cranks:
         """A_i = r_i (cos, sin) of the pivot's direction."""
