@@ -65,8 +65,8 @@ def test_a_sweep_judges_damps_and_draws(kind, tmp_path, capsys):
 [sweep.axes]
 gain = {{ from = 0.5, to = 1.0, count = 2 }}
 link_subsets = "all"
-"machine.kinds.{kind}.{'crank_length' if kind == 'five_bar' else 'rail_height'}" = {
-        [0.15, 0.16] if kind == 'five_bar' else [0.0, 0.01]
+"machine.kinds.{kind}.{"crank_length" if kind == "five_bar" else "rail_height"}" = {
+        [0.15, 0.16] if kind == "five_bar" else [0.0, 0.01]
     }
 """
     main(["sweep", written(tmp_path, kind, more), "--out", str(tmp_path / "sweep")])
