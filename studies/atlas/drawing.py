@@ -38,7 +38,7 @@ def draw_machine(
     ax.fill(*(1e3 * parts.joint[k].T), color=color, alpha=0.25 * alpha, linewidth=0)
     for link in parts.link[k]:
         ax.plot(*(1e3 * link.T), color=color, linewidth=1.6, alpha=alpha)
-    ax.plot(*(1e3 * parts.slider[k].T), "s", color="#333333", markersize=4, alpha=alpha)
+    ax.plot(*(1e3 * parts.near[k].T), "s", color="#333333", markersize=4, alpha=alpha)
     ax.plot(*(1e3 * parts.joint[k].T), "o", color="#333333", markersize=2.5, alpha=alpha)
     ax.set_aspect("equal")
     ax.set_xlabel("x [mm]")
@@ -48,12 +48,12 @@ def draw_machine(
 
 def number_links(parts: Skeleton, k: int, ax: Axes) -> None:
     """Write link numbers next to the sliders, on the side away from the machine."""
-    away = parts.slider[k] - parts.joint[k].mean(axis=0)
+    away = parts.near[k] - parts.joint[k].mean(axis=0)
     away /= np.linalg.norm(away, axis=1, keepdims=True)
-    for i, (slider, side) in enumerate(zip(parts.slider[k], away, strict=True)):
+    for i, (near, side) in enumerate(zip(parts.near[k], away, strict=True)):
         ax.annotate(
             str(i + 1),
-            1e3 * slider,
+            1e3 * near,
             10 * side,
             textcoords="offset points",
             fontsize=SMALL,
@@ -67,16 +67,18 @@ def mode_skeleton(study: Study, pose: np.ndarray, shape: np.ndarray) -> Skeleton
 
     Args:
         study: the machine.
-        pose: at rest [m, m, rad], (3,).
-        shape: of the mode over (X, q), (3 + 3R,).
+        pose: at rest [m, m, rad], (p,).
+        shape: of the mode over (X, q), (p + n R,).
     """
-    length, q = study.each_link(study.link.length).min(), shape[3:].reshape(3, -1)
-    size = np.abs(shape[:3]) * [1, 1, study.each_link(study.machine.joint_radius).mean()]
+    count = study.n_pose
+    length, q = study.each_link(study.link.length).min(), shape[count:].reshape(study.n_links, -1)
+    scale = [1, 1, study.each_link(study.machine.joint_radius).mean()][:count]
+    size = np.abs(shape[:count]) * scale
     factor = min(
         DRAWN * length / max(np.abs(q).max(), 1e-300), DRAWN_POSE * length / max(size.max(), 1e-300)
     )
     phases = np.array([0.0, 1.0, -1.0])
-    moved = pose + factor * phases[:, None] * shape[:3]
+    moved = pose + factor * phases[:, None] * shape[:count]
     return skeleton(study, moved, factor * phases[:, None, None] * q, 1.0)
 
 
@@ -120,10 +122,10 @@ def animate(clip: Clip, path: Path) -> None:
                 f"{1e3 * clip.time[k]:+.0f} ms from the end of the move; bending drawn "
                 f"{clip.exaggeration:.0f} times"
             )
-            for parts, (links, sliders, joints, plate) in zip(clip.parts, lines, strict=True):
-                for line, points in zip(links, parts.link[k], strict=True):
+            for parts, (carried, near, joints, plate) in zip(clip.parts, lines, strict=True):
+                for line, points in zip(carried, [*parts.carrier[k], *parts.link[k]], strict=True):
                     line.set_data(*(1e3 * points.T))
-                sliders.set_data(*(1e3 * parts.slider[k].T))
+                near.set_data(*(1e3 * parts.near[k].T))
                 joints.set_data(*(1e3 * parts.joint[k].T))
                 plate.set_xy(1e3 * parts.joint[k])
             return []
@@ -137,5 +139,5 @@ def animate(clip: Clip, path: Path) -> None:
 
 def _moving(parts: Skeleton, ax: Axes) -> tuple[Any, ...]:
     draw_machine(parts, 0, ax)
-    links = ax.lines[3:6]
-    return links, ax.lines[6], ax.lines[7], ax.patches[0]
+    *carried, near, joints = ax.lines
+    return carried, near, joints, ax.patches[0]

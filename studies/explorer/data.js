@@ -33,7 +33,7 @@ async function readData() {
   data.status = array(data.status).values;
   data.placement = data.placement && arrays(data.placement);
   for (const replay of data.replays) {
-    for (const key of ["time", "frameTime", "guide"]) replay[key] = array(replay[key]);
+    for (const key of ["time", "frameTime", "frame"]) replay[key] = array(replay[key]);
     replay.motions = replay.motions.map(arrays);
   }
   data.replayOf = new Map(data.replays.map((replay) => [replay.row, replay]));

@@ -88,7 +88,7 @@ class ChosenCase {
     const { length, actuator, sensor, centers, is_controlled: isControlled } = data.placement;
     const width = canvas.parentElement.clientWidth;
     const context = fit(canvas, width, 190);
-    const links = [0, 1, 2];
+    const links = [...Array(length.inner[0]).keys()];
     const longest = Math.max(...links.map((i) => length.at(row, i)));
     const scale = (width - 74) / longest;
     const count = centers.inner[1];
@@ -116,7 +116,7 @@ class ChosenCase {
       }
     }
     context.textAlign = "right";
-    context.fillText("centres from the slider joint [mm]", width - 2, 184);
+    context.fillText("centres from the actuated joint [mm]", width - 2, 184);
   }
 
   drawResponse() {
@@ -163,13 +163,8 @@ class ChosenCase {
     const width = canvas.parentElement.clientWidth;
     const height = Math.min(width, 380);
     const context = fit(canvas, width, height);
-    const to = framed(replay.guide, width, height);
-    context.lineWidth = 3;
-    context.strokeStyle = "#bbb";
-    for (let i = 0; i < 3; i++) {
-      const [a, b] = [0, 1].map((end) => to(replay.guide.at(i, 2 * end), replay.guide.at(i, 2 * end + 1)));
-      tick(context, ...a, ...b);
-    }
+    const to = framed(replay.frame, width, height);
+    drawCarriers(context, replay.motions[0].carrier, frame, to);
     const { controlled, without } = this.state.data.colors;
     const both = replay.motions.length > 1;
     if (both) drawParts(context, replay.motions[1], frame, to, without, 0.7);
@@ -197,37 +192,44 @@ class ChosenCase {
   }
 }
 
-/** Slider, links and platform of a motion. */
-function drawParts(context, { slider, joint, link }, frame, to, color, alpha) {
+/** Guides or cranks. */
+function drawCarriers(context, carrier, frame, to) {
+  context.lineWidth = 3;
+  context.strokeStyle = "#bbb";
+  for (let i = 0; i < carrier.inner[0]; i++) {
+    const [a, b] = [4 * i, 4 * i + 2].map((k) => to(carrier.at(frame, k), carrier.at(frame, k + 1)));
+    tick(context, ...a, ...b);
+  }
+}
+
+/** Links, their joints and the platform of a motion. */
+function drawParts(context, { near, joint, link }, frame, to, color, alpha) {
   context.globalAlpha = alpha;
   context.strokeStyle = color;
   context.fillStyle = color;
   context.lineWidth = 2;
-  const points = link.inner[1];
-  for (let i = 0; i < 3; i++) {
+  const [links, points] = link.inner;
+  for (let i = 0; i < links; i++) {
     context.beginPath();
     for (let p = 0; p < points; p++) {
       const k = 2 * (i * points + p);
       context.lineTo(...to(link.at(frame, k), link.at(frame, k + 1)));
     }
     context.stroke();
-    const [x, y] = to(slider.at(frame, 2 * i), slider.at(frame, 2 * i + 1));
+    const [x, y] = to(near.at(frame, 2 * i), near.at(frame, 2 * i + 1));
     context.fillRect(x - 4, y - 4, 8, 8);
   }
   context.beginPath();
-  for (let i = 0; i < 3; i++) context.lineTo(...to(joint.at(frame, 2 * i), joint.at(frame, 2 * i + 1)));
+  for (let i = 0; i < links; i++) context.lineTo(...to(joint.at(frame, 2 * i), joint.at(frame, 2 * i + 1)));
   context.closePath();
   context.globalAlpha = 0.25 * alpha;
   context.fill();
   context.globalAlpha = 1;
 }
 
-/** From millimetres to pixels, so that the guides fill the canvas. */
-function framed(guide, width, height) {
-  const ends = [0, 1, 2].flatMap((i) => [0, 1].map((end) => [guide.at(i, 2 * end), guide.at(i, 2 * end + 1)]));
-  const [xs, ys] = [0, 1].map((k) => ends.map((end) => end[k]));
-  const [left, right] = [Math.min(...xs), Math.max(...xs)];
-  const [low, high] = [Math.min(...ys), Math.max(...ys)];
+/** From millimetres to pixels, so that the machine fills the canvas. */
+function framed(frame, width, height) {
+  const [left, right, low, high] = frame.values;
   const scale = 0.9 * Math.min(width / (right - left), height / (high - low));
   return (x, y) => [
     width / 2 + (x - (left + right) / 2) * scale,

@@ -175,7 +175,7 @@ def _replay(replay: ReplayedCase, place: int, packed: _Arrays) -> dict[str, Any]
         "time": packed.add(replay.time),
         "frameTime": packed.add(replay.frame_time),
         "exaggeration": replay.exaggeration,
-        "guide": packed.add(replay.guide),
+        "frame": packed.add(replay.frame),
         "motions": [motion(one) for one in replay.motions],
     }
 

@@ -31,10 +31,11 @@ AFTER = 0.05
 class DrawnMotion(NamedTuple):
     """A run in pictures; lengths in mm."""
 
-    deflection: np.ndarray  # of mid-spans [um], (T, 3)
-    slider: np.ndarray  # (K, 3, 2)
-    joint: np.ndarray  # (K, 3, 2)
-    link: np.ndarray  # points along the links, bent as drawn, (K, 3, points, 2)
+    deflection: np.ndarray  # of mid-spans [um], (T, n)
+    carrier: np.ndarray  # ends of what carries the links, (K, n, 2, 2)
+    near: np.ndarray  # joints of the links with it, (K, n, 2)
+    joint: np.ndarray  # and with the platform, (K, n, 2)
+    link: np.ndarray  # points along the links, bent as drawn, (K, n, points, 2)
 
 
 class ReplayedCase(NamedTuple):
@@ -44,7 +45,7 @@ class ReplayedCase(NamedTuple):
     time: np.ndarray  # of the deflections, from the end of the reference trajectory [ms], (T,)
     frame_time: np.ndarray  # [ms], (K,)
     exaggeration: float  # of the bending drawn [1]; 0: none that could be seen
-    guide: np.ndarray  # ends of the guides [mm], (3, 2, 2)
+    frame: np.ndarray  # left, right, low, high of what is drawn [mm], (4,)
     motions: tuple[DrawnMotion, ...]  # as given and, if its links are controlled, without control
 
 
@@ -91,7 +92,8 @@ def _in_pictures(row: int, run: Run, twin: Run | None) -> ReplayedCase:
         motions.append(
             DrawnMotion(
                 deflection=1e6 * deflection[points],
-                slider=1e3 * parts.slider,
+                carrier=1e3 * parts.carrier,
+                near=1e3 * parts.near,
                 joint=1e3 * parts.joint,
                 link=1e3 * parts.link[:, :, ::EVERY],
             )
@@ -101,9 +103,15 @@ def _in_pictures(row: int, run: Run, twin: Run | None) -> ReplayedCase:
         time=1e3 * (time[points] - end),
         frame_time=1e3 * (time[frames] - end),
         exaggeration=factor,
-        guide=1e3 * parts.carrier[0],
+        frame=_extent(motions),
         motions=tuple(motions),
     )
+
+
+def _extent(motions: list[DrawnMotion]) -> np.ndarray:
+    parts = [x.reshape(-1, 2) for one in motions for x in (one.carrier, one.joint)]
+    points = np.concatenate(parts)
+    return np.stack([points.min(axis=0), points.max(axis=0)], axis=1).ravel()
 
 
 def exaggeration(peak: float, length: float) -> float:

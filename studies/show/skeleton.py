@@ -25,7 +25,7 @@ class Skeleton(NamedTuple):
     """Positions of all parts, (T, ...) in metres."""
 
     carrier: np.ndarray  # ends of guides or cranks, (T, n, 2, 2)
-    slider: np.ndarray  # B, (T, n, 2)
+    near: np.ndarray  # B, (T, n, 2)
     joint: np.ndarray  # C, (T, n, 2)
     link: np.ndarray  # points along the links, (T, n, points, 2)
 
@@ -40,13 +40,13 @@ def skeleton(study: Study, pose: np.ndarray, q: np.ndarray, exaggeration: float)
         exaggeration: factor on the bending [1].
     """
     structure, case = check_run(study.change(link__modes=q.shape[-1], control__feedback="none"))
-    slider, joint, link = (
+    near, joint, link = (
         np.asarray(part)
         for part in _positions(structure._replace(n_steps=1), case, pose, q, exaggeration)
     )
     carriers = case.machine.geometry.carriers(case.machine.masses.slider_mass)
-    lines = [[one.line(x) for one, x in zip(carriers, at, strict=True)] for at in slider]
-    return Skeleton(np.array(lines), slider, joint, link)
+    lines = [[one.line(x) for one, x in zip(carriers, at, strict=True)] for at in near]
+    return Skeleton(np.array(lines), near, joint, link)
 
 
 @kept_jit(static_argnums=0)
@@ -69,11 +69,11 @@ def _positions(
         # one joint of all links where the platform is a point
         far = [jnp.broadcast_to(x, plant.length.shape) for x in chain.far]
         joint = jnp.stack(far, axis=1)
-        slider = joint - jnp.stack(chain.near.to_far(), axis=1)
-        chord = joint - slider
+        near = joint - jnp.stack(chain.near.to_far(), axis=1)
+        chord = joint - near
         across = jnp.stack([-chord[:, 1], chord[:, 0]], axis=1) / plant.length[:, None]
         bent = exaggeration * jnp.einsum("isr,ir->is", shape, q)
-        straight = slider[:, None] + along[:, None] * chord[:, None]
-        return slider, joint, straight + bent[..., None] * across[:, None]
+        straight = near[:, None] + along[:, None] * chord[:, None]
+        return near, joint, straight + bent[..., None] * across[:, None]
 
     return jax.vmap(one)(pose, q)
