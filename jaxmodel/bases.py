@@ -55,7 +55,7 @@ def find_bases(structure: Structure, case: Case) -> Bases:
 
 
 def station_places(case: Case) -> Array:
-    """Where the chord deflection of each link is taken, from the slider joint [m], (3, S)."""
+    """Where the chord deflection of each link is taken, from the actuated joint [m], (3, S)."""
     length = jnp.broadcast_to(case.machine.beam.length, (case.machine.n_links,))
     return length[:, None] * case.windows.stations
 

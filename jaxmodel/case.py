@@ -41,7 +41,7 @@ class Structure(NamedTuple):
     has_notch: bool = False  # notch filters before the feedback
     has_hysteresis: bool = False  # of the actuators, near their voltage limit
     has_noise: bool = False  # seeded ADC noise and force ripple
-    has_friction: bool = False  # Coulomb friction on the sliders
+    has_friction: bool = False  # Coulomb friction of the drives
     has_poles: bool = False  # gains follow from poles
     has_position_gain: bool = True  # feedback of modal positions, not of velocities alone
     metrics: tuple[str, ...] = ()  # to accumulate; (): all of them
@@ -130,7 +130,7 @@ class Shaping(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """Slider servo and its disturbances; (3,) or ()."""
+    """Drives and their disturbances; (3,) or ()."""
 
     kp: Array  # [N/m]
     kd: Array  # [N s/m]
@@ -143,7 +143,7 @@ class Drive(NamedTuple):
     pulse_force: Array  # disturbance [N], (3,)
     pulse_start: Array  # [s], ()
     pulse_length: Array  # [s], ()
-    is_locked: Array  # 1: sliders held (bases with Y(L) = 0), ()
+    is_locked: Array  # 1: drives held (bases with Y(L) = 0), ()
     parameters: dict[str, Array]  # the drive's own, by name
 
 

@@ -1,4 +1,4 @@
-"""Forces along the guides: motors with their limit, smooth friction, disturbances."""
+"""Forces on the actuated joints: motors with their limit, smooth friction, disturbances."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jaxmodel.parameters import Array
 
 
 class Reference(NamedTuple):
-    """Desired motion of the sliders at one instant, (3,) each."""
+    """Desired motion of the actuated joints at one instant, (3,) each."""
 
     rho: Array  # [m]
     rho_rate: Array  # [m/s]
@@ -34,7 +34,7 @@ def motor_force(
         structure: static choices.
         drive: numbers and limit, fields (3,) or ().
         reference: desired motion.
-        rho: slider positions [m], (3,).
+        rho: actuated coordinates [m], (3,).
         rho_rate: [m/s], (3,).
     """
     force = reference.held
@@ -54,7 +54,7 @@ def _error(reference: Reference, rho: Array, rho_rate: Array) -> SliderError:
 def slider_force(
     structure: Structure, drive: Drive, reference: Reference, rho: Array, rho_rate: Array
 ) -> Array:
-    """Force on the sliders [N], (3,): motors, friction F_c tanh(rho'/v) + c rho', disturbance.
+    """Force on the joints [N], (n,): motors, friction F_c tanh(rho'/v) + c rho', disturbance.
 
     Args:
         structure, drive, reference, rho, rho_rate: as in `motor_force`; tanh is costly, so Coulomb
@@ -85,7 +85,7 @@ def drive_step(
         period: of a sample [s], ().
         state: force held over this sample, memory.
         reference: desired motion at the sampling instant.
-        rho: slider positions there [m], (3,).
+        rho: actuated coordinates there [m], (3,).
         rho_rate: [m/s], (3,).
         applied: feedback that acts during this sample, after the limit of the motors [N], (3,).
     """

@@ -99,7 +99,7 @@ def accelerations(
         pose_rate: (3,).
         q: modal coordinates [m], (3, R).
         q_rate: [m/s], (3, R).
-        slider_force: along the guides [N], (3,).
+        slider_force: on the actuated joints [N], (3,).
         piezo: generalised piezo forces (14) over the modal masses, Q_j/m_j [m/s2], (3, R).
         wrench: force and moment on the platform at its reference point [N, N, N m], (3,), or None.
         is_coupled: False: kineto-elastodynamics in two passes (static): the machine moves as if its
@@ -480,7 +480,7 @@ def with_platform(plant: Plant, factor: Array) -> Plant:
 def inverse_dynamics(
     plant: Plant, pose: Array, pose_rate: Array, pose_acc: Array, wrench: Array | None = None
 ) -> Array:
-    """Slider forces [N] for a desired pose acceleration of the unbent machine (computed torque).
+    """Drive forces [N] for a desired pose acceleration of the unbent machine (computed torque).
 
     M_p X'' + sum J^t T^t (K (rho'', gamma'') + load) = wrench + sum J^t T^t (F, 0) over the links.
 

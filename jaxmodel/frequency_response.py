@@ -6,7 +6,7 @@ equations for the pose (docs/theory.md, "Margins by frequency response"). The su
 complete: the images that are not evaluated follow a power law, whose sum is known.
 
 All responses are complex, of commands [V] to sampled sensor voltages [V], link by link, patch by
-patch, for any law; those of forces on the sliders [N] and of chord deflections [m] are beside them.
+patch, for any law; those of forces on the joints [N] and of chord deflections [m] are beside them.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class PlantResponse(NamedTuple):
     direct: Array  # sensor volts per actuator volt by modes that are left out, (3, K, K)
     deflection: Array  # from the chord at the stations per modal coordinate, (3, S, R)
     direct_deflection: Array  # the same per actuator volt by modes that are left out, (3, S, K)
-    slide: Array  # of the sliders per motion of the pose, (3, 3)
+    slide: Array  # of the actuated joints per motion of the pose, (3, 3)
     period: Array  # T [s], ()
     antialias: Array  # [rad/s], ()
     highpass: Array | None  # of the patches [rad/s], None if there is none, ()
@@ -246,9 +246,9 @@ class Images(NamedTuple):
     """Responses at s_n before they are summed, complex, (I, outputs, inputs) each."""
 
     sensed: Array  # sensor volts per held command [V/V], (I, 3 K, 3 K)
-    disturbed: Array  # sensor volts per held force on a slider [V/N], (I, 3 K, 3)
+    disturbed: Array  # sensor volts per held force on an actuated joint [V/N], (I, 3 K, 3)
     bent: Array  # chord deflections by the plant's modes per held command [m/V], (I, 3 S, 3 K)
-    pushed: Array  # the same per held force on a slider [m/N], (I, 3 S, 3)
+    pushed: Array  # the same per held force on an actuated joint [m/N], (I, 3 S, 3)
 
 
 def plant_images(plant: PlantResponse, omega: Array, order: np.ndarray) -> Images:
@@ -398,7 +398,9 @@ class ClosedLoop(NamedTuple):
 
     sensitivity: Array  # S = (I + L)^-1 of the commands [1], (3 K, 3 K)
     control_effort: Array  # commands per disturbance of the sensor voltages, S K [1], (3 K, 3 K)
-    disturbance_deflection: Array  # chord deflections per force on a slider [m/N], (3 S, 3)
+    disturbance_deflection: (
+        Array  # chord deflections per force on an actuated joint [m/N], (3 S, 3)
+    )
 
 
 def close_loop(response: SampledLoopResponse, omega: Array, is_exact: bool = True) -> ClosedLoop:

@@ -1,4 +1,4 @@
-"""The closed chain (6) in closed form: slider positions and link angles from pose and bending.
+"""The closed chain (6) in closed form: actuated coordinates and link angles from pose and bending.
 
 In the frame of a link's chord (along t, across n_t) its far joint C lies at (c, w):
 w = sum Y_j(L) q_j is zero in bases whose ends lie on the chord, and there c = L - d is shorter than
@@ -191,7 +191,7 @@ def link_direction(chain: Chain) -> Array:
 
 
 def singularity_distance(plant: Plant, pose: Array) -> Array:
-    """Distance of a path from poses that sliders cannot pass or cannot hold [rad], ().
+    """Distance of a path from poses that drives cannot pass or cannot hold [rad], ().
 
     The smaller of two: of any link angle gamma from 0 and 90 deg, and `hold`.
 
@@ -245,7 +245,7 @@ def over_poses(plant: Plant, axes: int) -> Plant:
 
 
 def inverse_kinematics(plant: Plant, pose: Array, pose_rate: Array) -> tuple[Array, Array]:
-    """Slider positions [m] and rates [m/s] of the undeformed machine for poses on any time axis.
+    """Actuated coordinates [m] and rates [m/s] of the unbent machine for poses on any time axis.
 
     Args:
         plant: the machine.

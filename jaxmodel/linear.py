@@ -27,13 +27,13 @@ class LinearPlant(NamedTuple):
 
     state: Array  # A [1/s and mixed], (n, n), n = 6 + 6 R
     voltage: Array  # B_voltage, (n, 3 K)
-    force: Array  # B_force, disturbance on the sliders, (n, 3)
+    force: Array  # B_force, disturbance on the actuated joints, (n, 3)
     deflection: Array  # chord deflection at the stations [m], (3 S, n)
     sensor: Array  # voltages of the sensors, open-circuit [V], (3 K, n)
     # what the actuators' voltages add at once to both, by the modes that are left out
     direct_deflection: Array  # [m/V], (3 S, 3 K)
     direct_sensor: Array  # [V/V], (3 K, 3 K)
-    # what a sampled drive reads: positions of the sliders [m], then their speeds [m/s], (6, n)
+    # what a sampled drive reads: positions of the joints [m], then their speeds [m/s], (2 l, n)
     slider: Array | None = None
 
 
@@ -79,7 +79,7 @@ def linearise(
         loop: constants of the case.
         pose: (x, y, phi) [m, m, rad], (3,).
         moment: motion and load there, taken as lasting; None: at rest without load.
-        is_held: leave out the feedback of the sliders' drive, whose force is held; otherwise a
+        is_held: leave out the feedback of the drives, whose force is held; otherwise a
             sampled drive acts by its `drive_gains`, in continuous time.
 
     Returns:

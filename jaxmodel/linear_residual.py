@@ -46,7 +46,7 @@ def linear_residual(structure: Structure, case: Case, matrices: LoopMatrices) ->
         force = jnp.zeros_like(inputs.disturbance)
         seen = jnp.concatenate([inputs.rho[:, 0] - home, inputs.rho_rate[:, 0]], axis=1)
         follow = matrices.reference
-    if structure.has_wrench:  # a pulse on the platform acts like slider forces that hold against it
+    if structure.has_wrench:  # a pulse on the platform acts like drive forces that hold against it
         pulse = inputs.wrench - case.load.wrench
         still = jnp.zeros_like(start.state.plant.pose)
         held = partial(inverse_dynamics, start.loop.plant, start.state.plant.pose, still, still)

@@ -128,11 +128,11 @@ class State(NamedTuple):
 class Inputs(NamedTuple):
     """External inputs of one sample, at P = 2 substeps + 1 points from start to end."""
 
-    rho: Array  # desired slider position [m], (P, 3)
+    rho: Array  # desired actuated coordinate [m], (P, 3)
     rho_rate: Array  # [m/s], (P, 3)
     feedforward: Array | None  # [N], (P, 3)
     pose: Array  # desired pose at the start [m, m, rad], (3,)
-    disturbance: Array  # slider force held over the sample [N], (3,)
+    disturbance: Array  # drive force held over the sample [N], (3,)
     wrench: Array | None  # on the platform, held over the sample [N, N, N m], (3,)
     adc_noise: Array | None  # standard normal, (3, K)
     window: metrics.Window

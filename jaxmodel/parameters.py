@@ -32,7 +32,7 @@ class Beam(NamedTuple):
     density: Array  # [kg/m3]
     youngs_modulus: Array  # E [Pa]
     stiffness_factor: Array  # true bending stiffness over the one controller and shaper assume [1]
-    joint_inertia_b: Array  # rotary inertia J_B at the slider joint [kg m2]
+    joint_inertia_b: Array  # rotary inertia J_B at the actuated joint [kg m2]
     joint_inertia_c: Array  # rotary inertia J_C at the platform joint [kg m2]
 
 

@@ -53,7 +53,7 @@ def damping_ratio(damping: Damping, omega: Array) -> Array:
     return specified * (omega / jnp.take_along_axis(omega, own, axis=1)) ** damping.exponent
 
 
-#: Mass added to locked sliders [kg]: 1 N for 1 s moves it by 0.5 nm.
+#: Mass added to locked drives [kg]: 1 N for 1 s moves it by 0.5 nm.
 LOCK_MASS = 1e9
 
 
@@ -71,7 +71,7 @@ def build_plant(
     Args:
         machine: physical description.
         basis: modal basis of the links.
-        is_locked: hold all sliders, by `LOCK_MASS`.
+        is_locked: hold all actuated joints, by `LOCK_MASS`.
         has_shortening: bent links have shorter chords (static); False: as in the paper.
         is_distributed: every point of a bent link moves inwards by its own amount (static); False:
             half of the link moves in with joint C.

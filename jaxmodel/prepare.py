@@ -432,10 +432,10 @@ def _is_finite(case: Case) -> Array:
 
 
 def drive_rate(kind: str, case: Case) -> Array:
-    """Bound on the rate of the sliders' drive, d/m_s + sqrt(Kp/m_s) [1/s], ().
+    """Bound on the rate of the drives, d/m_s + sqrt(Kp/m_s) [1/s], ().
 
-    d adds Kd, viscous friction and the steepest slope of the friction law; the mass that a slider
-    feels is at least its own. Locked sliders have none; of a sampled drive, whose force is held,
+    d adds Kd, viscous friction and the steepest slope of the friction law; the mass that a joint
+    feels is at least its own. Locked drives have none; of a sampled drive, whose force is held,
     only friction remains. `kind` is a name in `DRIVES`.
     """
     drive, mass = case.drive, case.machine.masses.slider_mass

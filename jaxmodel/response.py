@@ -1,8 +1,8 @@
 """The machine as a test bench sees it: linear about a pose, from inputs to measured outputs.
 
-Inputs are voltages on the actuators, forces on the sliders, and a hammer on a link; outputs are
-voltages of the sensors, chord deflections, motions of points of the links, slider positions and the
-pose. The controller is off, the drive holds the pose.
+Inputs are voltages on the actuators, forces on the actuated joints, and a hammer on a link; outputs
+are voltages of the sensors, chord deflections, motions of points of the links, actuated coordinates
+and the pose. The controller is off, the drive holds the pose.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ class BenchPlant(NamedTuple):
 
     state: Array  # A [1/s and mixed], (n, n)
     actuator: Array  # B of the voltages on the actuators, (n, 3 K)
-    slider_force: Array  # B of forces on the sliders, (n, 3)
+    slider_force: Array  # B of forces on the actuated joints, (n, 3)
     hammer: Array  # B of forces across the links at the stations, (n, 3 S)
     sensor: Array  # voltages of the sensors [V], (3 K, n)
     deflection: Array  # chord deflection at the stations [m], (3 S, n)
     across: Array  # of a point at a station in the plane, across its link [m], (3 S, n)
     along: Array  # the same along its link [m], (3 S, n)
-    slider: Array  # slider positions [m], (3, n)
+    slider: Array  # actuated coordinates [m], (3, n)
     pose: Array  # [m, m, rad], (3, n)
     # D, of the modes that are left out; zero for all other pairs
     actuator_to_sensor: Array  # [V/V], (3 K, 3 K)
     actuator_to_deflection: Array  # [m/V], (3 S, 3 K)
-    drive: Array  # proportional and derivative gain of the sliders' drive [N/m, N s/m], (2, 3)
+    drive: Array  # proportional and derivative gain of the drives [N/m, N s/m], (2, 3)
 
 
 def bench_plant(structure: Structure, case: Case, pose: Array) -> BenchPlant:

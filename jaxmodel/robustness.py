@@ -88,7 +88,7 @@ def norm_peaks(response: SampledLoopResponse, names: tuple[str, ...]) -> dict[st
     Returns:
         Each figure, (): `sensitivity_peak`, largest singular value of S at the commands [1];
         `control_effort_peak`, of sensor voltages to commands [1]; `disturbance_deflection_peak`, of
-        held slider forces to chord deflections [m/N].
+        held drive forces to chord deflections [m/N].
 
     Example:
         >>> peaks = norm_peaks(response, ("sensitivity_peak",))  # doctest: +SKIP

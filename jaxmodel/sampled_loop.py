@@ -39,10 +39,10 @@ class LoopMatrices(NamedTuple):
     open: Array  # all gains zero, (n, n)
     feedback: Array  # what the gains add, (n, n)
     plant: Array  # A of the continuous uncontrolled plant with drive, for its poles, (m, m)
-    force: Array  # response to slider forces held over the sample, (n, 3)
+    force: Array  # response to drive forces held over the sample, (n, 3)
     deflection: Array  # chord deflection at the stations [m], rows, (3 S, n)
-    # response of a sampled drive's state to the reference of the sliders, positions [m], then
-    # speeds [m/s], (n, 6); None: the drive acts in continuous time
+    # response of a sampled drive's state to the reference of the joints, positions [m], then
+    # speeds [m/s], (n, 2 l); None: the drive acts in continuous time
     reference: Array | None = None
 
 
@@ -221,7 +221,7 @@ class DelayedParts(NamedTuple):
 
     matrix: Array  # transition, 0 for plant and electronics, (m, m)
     state: Array  # A of plant and electronics, (n, n)
-    enters: Array  # B of commands and slider forces, (n, 3 K + 3)
+    enters: Array  # B of commands and drive forces, (n, 3 K + 3)
     commands: Array  # place of every command u_(k-1) in the state, (3 K,), integers
     forces: Array | None  # place of the forces that a sampled drive holds, (3,), integers
 
@@ -325,7 +325,7 @@ class AnaloguePlant(NamedTuple):
     """Plant and electronics between two samples."""
 
     state: Array  # A, (n, n)
-    enters: Array  # B of commands and slider forces, (n, 3 K + 3)
+    enters: Array  # B of commands and drive forces, (n, 3 K + 3)
     filtered: slice  # of the state: what the converters see
     voltage: slice | None  # of the state: on the actuators; None: the command itself
     size: Array  # typical size of each entry of the state, (n,)
@@ -336,7 +336,7 @@ class _Sampled(NamedTuple):
 
     held: Array  # by the state and u_(k-1), (n, n + 3 K)
     newest: Array | None  # by u_k, if its delay can be below a sample, (n, 3 K)
-    force: Array  # by slider forces held over the sample, (n, 3)
+    force: Array  # by drive forces held over the sample, (n, 3)
     present: Array  # command on the actuators, of state and u_(k-1), (3 K, n + 3 K)
 
 

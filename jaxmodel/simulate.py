@@ -35,7 +35,7 @@ class Result(NamedTuple):
     command_end: Array  # end of the shaped reference [s], ()
     sensor_condition: Array  # condition number of the modal filter per link [1], (3,)
     actuator_condition: Array  # of the synthesizer [1], (3,)
-    singularity_distance: Array  # of the path from poses no slider reaches or holds [rad], ()
+    singularity_distance: Array  # of the path from poses no drive reaches or holds [rad], ()
     record: Record | None  # trajectories, leading axis (n_steps,), if asked for
 
 
@@ -47,7 +47,7 @@ class Command(NamedTuple):
     end: Array  # end of the shaped reference [s], ()
     status: Array  # reach, singularity or length fault of the command, as a float, ()
     bad_time: Array  # when it appears [s], ()
-    singularity_distance: Array  # of the path from poses no slider reaches or holds [rad], ()
+    singularity_distance: Array  # of the path from poses no drive reaches or holds [rad], ()
 
 
 def command(structure: Structure, case: Case, prepared: Prepared) -> Command:

@@ -335,7 +335,7 @@ REFUSED = [
     ({"method": "list", "cases": [{"control.gain_factor ": 0.2}]}, "unknown field; did you mean"),
     ({"axes": {"motion.move_time": [[]]}}, "as many as there are moves"),
     ({"axes": {"motion.dwell": [[0.01, 0.02]]}}, "as many as there are moves"),
-    ({"axes": {"drive.locked": "all"}}, "locked sliders follow no path"),
+    ({"axes": {"drive.locked": "all"}}, "locked drives follow no path"),
     (
         {"axes": {"control.velocity_gain": [[1.0, 1.0, 1.0]], "motion.waypoints[1]": [[0.0]]}},
         "motion.waypoints",

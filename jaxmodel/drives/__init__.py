@@ -1,4 +1,4 @@
-"""Drives of the sliders, one file each; `contract` defines what a drive is.
+"""Drives of the actuated joints, one file each; `contract` defines what a drive is.
 
 A drive in `DRIVES` can be selected by `drive.kind` in a study file, swept, tuned and judged. To add
 one, write a file like `sliding_mode` and add its `DriveLaw` to the list below; from outside the

@@ -1,11 +1,11 @@
-"""What a drive is: the force that it feeds back from the error of a slider, and its parameters.
+"""What a drive is: its parameters, and the force that it feeds back from the error of a joint.
 
 The motor force is F = limit(F_ff + F_fb), where F_ff is the feed-forward (computed torque, or what
 holds a steady load) and F_fb what a `DriveLaw` feeds back. A law that is not sampled acts in
 continuous time, as an analogue servo would. A sampled one runs in the controller of the links: it
-reads position and speed of its slider at a sampling instant, and its F_fb goes out one sample later
-and is held, like the voltages; it can remember one number a slider. All functions are elementwise
-over the sliders, arrays (3,), and become part of the compiled step.
+reads position and speed of its joint at a sampling instant, and its F_fb goes out one sample later
+and is held, like the voltages; it can remember one number a joint. All functions are elementwise
+over the joints, arrays (3,), and become part of the compiled step.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from jaxmodel.table import Parameter, PartError, check_parameters
 
 
 class SliderError(NamedTuple):
-    """Reference less measured motion of the sliders, (3,) each."""
+    """Reference less measured motion of the actuated joints, (3,) each."""
 
     position: Array  # e = rho_d - rho [m]
     rate: Array  # e' [m/s]
 
 
 class DriveLaw(NamedTuple):
-    """A drive of the sliders.
+    """A drives.
 
     `force(drive, memory, error, is_smooth)` returns F_fb [N]: `memory` is what the law remembers,
     None for one without `update`; `is_smooth` asks for limits with round corners (`soft_limit`). It
@@ -76,7 +76,7 @@ def resting_drive(law: DriveLaw, like: Array) -> DriveState | None:
 
     Args:
         law: of the drive.
-        like: any array of the sliders, (3,).
+        like: any array of the actuated joints, (3,).
     """
     if not law.is_sampled:
         return None
@@ -107,9 +107,9 @@ def drive_gains(law: DriveLaw, drive: Drive) -> DriveGains:
     return DriveGains(slope(one, zero), slope(zero, one))
 
 
-#: Of drives that know the inertia that a slider moves.
+#: Of drives that know the inertia that an actuated joint moves.
 INERTIA = Parameter(
-    "inertia", 0.185, "kg", "mass that a slider moves, in the drive's model", 1e-3, 1e3
+    "inertia", 0.185, "kg", "mass that an actuated joint moves, in the drive's model", 1e-3, 1e3
 )
 #: Of drives that make the error slide down e' = -decay e.
 DECAY = Parameter("decay", 150.0, "1/s", "lambda of the sliding variable e' + lambda e", 0.1, 1e5)

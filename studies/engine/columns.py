@@ -97,7 +97,7 @@ ON_DEMAND: dict[str, tuple[str, str]] = {
     ),
     "disturbance_deflection_peak": (
         "m/N",
-        "largest singular value from slider forces to chord deflections, with control",
+        "largest singular value from drive forces to chord deflections, with control",
     ),
 }
 PER_CASE |= {name: ((), *label) for name, label in ON_DEMAND.items()}

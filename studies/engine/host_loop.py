@@ -84,7 +84,7 @@ def link_poles(state: np.ndarray, n_links: int, n_tracked: int) -> np.ndarray:
 
 
 def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
-    """What moves at a pole: "mode 7 of links 1+2 (5606 Hz)", or the drive of the sliders.
+    """What moves at a pole: "mode 7 of links 1+2 (5606 Hz)", or the drives.
 
     The link modes named hold most of the energy omega^2 |q|^2 + |q'|^2 of the eigenvector. Whether
     the motion belongs to a link, the drive or a filter is decided by participation factors,
@@ -108,7 +108,7 @@ def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
     drive, links, filters = (abs(part.sum()) for part in parts)
     hertz = abs(np.log(pole)) / loop.period / (2 * np.pi)
     if drive > max(links, filters):
-        return f"drive of the sliders ({hertz:.0f} Hz)"
+        return f"drives ({hertz:.0f} Hz)"
     q, q_rate = np.abs(right[first:last].reshape(2, n, r))
     energy = (loop.omega * q) ** 2 + q_rate**2
     modes, moving = _dominant(energy.sum(axis=0)), _dominant(energy.sum(axis=1))

@@ -54,7 +54,7 @@ class Preflight(NamedTuple):
     motion_end: Any  # of the unshaped motion [s], ()
     shaper_length: Any  # [s], ()
     condition: Any  # worst condition number of filter and synthesizer [1], ()
-    drive_rate: Any  # of the sliders' drive and friction [1/s], ()
+    drive_rate: Any  # of the drives and their friction [1/s], ()
     coupled_rate: Any  # highest mode of links whose ends are not on their chords [rad/s], ()
     highest: Any  # frequency of the highest plant mode [rad/s], ()
     damping: Any  # largest damping ratio of a link mode [1], ()
@@ -330,7 +330,7 @@ def step_counts(needed: Any) -> np.ndarray:
 
 
 def _drive_substeps(study: Study, rate: float) -> int:
-    """Plant steps per sample that the sliders' drive and friction need, or as given."""
+    """Plant steps per sample that the drives and their friction need, or as given."""
     needed = max(int(np.ceil(rate / study.electronics.sample_rate_hz / STIFFNESS_LIMIT)), 1)
     written, drive = study.run.substeps, study.drive
     if needed <= (written or SUBSTEP_LIMIT):

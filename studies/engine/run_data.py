@@ -40,7 +40,7 @@ def metric_variables(result: Result) -> dict[str, Variable]:
 _RECORD_LABELS = {
     "pose": (("time", "pose_axis"), "m; m; rad", "platform pose (x, y, phi)"),
     "pose_error": (("time", "pose_axis"), "m; m; rad", "pose minus shaped reference"),
-    "slider": (("time", "slider_axis"), "m", "slider position rho"),
+    "slider": (("time", "slider_axis"), "m", "actuated coordinate rho"),
     "modal_coordinate": (("time", "link", "mode"), "m", "modal coordinates q of the plant"),
     "controlled_coordinate": (
         ("time", "link", "controlled_mode"),

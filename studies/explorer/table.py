@@ -34,7 +34,7 @@ class Placement(NamedTuple):
     length: np.ndarray  # of the links, (n, 3)
     actuator: np.ndarray  # of the patches, (n, 3)
     sensor: np.ndarray  # of the patches, (n, 3)
-    centers: np.ndarray  # of the pairs of patches, from the slider joint, (n, 3, P); NaN: none
+    centers: np.ndarray  # of the pairs of patches, from the actuated joint, (n, 3, P); NaN: none
     is_controlled: np.ndarray  # (n, 3)
 
 

@@ -211,7 +211,7 @@ class _Lines:
 def compare_drive(code: DriveCode, compiler: list[str]) -> tuple[float, float]:
     """Largest difference of the C code from the drive in JAX, over the largest force [1].
 
-    A random motion of the sliders that also reaches the limit of the motors.
+    A random motion of the actuated joints that also reaches the limit of the motors.
 
     Args:
         code: from `drive_code`.

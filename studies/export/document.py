@@ -74,7 +74,9 @@ class Document(DocumentPart):
     study: dict[str, Any] = Field(description="the complete study, as a study file holds it")
 
 
-ORDER = "wire = patches_per_link * (link - 1) + patch, from 1; patches counted from the slider"
+ORDER = (
+    "wire = patches_per_link * (link - 1) + patch, from 1; patches counted from the actuated joint"
+)
 STEPS = [
     "for each link by itself; memory, w1, w2 and the last command are 0 at the start",
     "sensor = (adc_code * adc_step - conditioner_bias) / conditioner_gain",

@@ -72,7 +72,7 @@ def _export_fixed(job: Job) -> ExportResult:
     exported = job.exported
     check_words(exported)
     if DRIVES[exported.structure.drive].is_sampled:
-        job.console.print("the sliders' drive is not part of it: --target c writes it, too")
+        job.console.print("the drives is not part of it: --target c writes it, too")
     check_loop(exported, exported.channels, "")
     reference = reference_motion(job)
     signals = respond(exported.channels, exported.controller, reference.codes)

@@ -133,7 +133,7 @@ def with_outputs_at(study: Study, place: Place, places: tuple[float, ...]) -> tu
     Args:
         study: the model.
         place: puts parameters among the numbers.
-        places: from the slider joint on, the same on all links, within the shortest one [m].
+        places: from the actuated joint on, the same on all links, within the shortest one [m].
     """
     longest = float(study.each_link(study.link.length).max())
     study = study.change(metrics__stations=tuple(x / longest for x in places))  # as many

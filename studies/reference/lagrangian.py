@@ -32,7 +32,7 @@ class RigidState(NamedTuple):
 class Loads(NamedTuple):
     """External forces."""
 
-    slider: Any  # along the guides [N], (3,)
+    slider: Any  # on the actuated joints [N], (3,)
     modal: Any  # on the modal coordinates [N], (3, R)
 
 

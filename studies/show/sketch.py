@@ -170,7 +170,7 @@ def _links_to_scale(ax: Axes, study: Study) -> None:
     ax.set_yticks(ticks, [f"link {i + 1}" for i in range(study.n_links)])
     ax.tick_params(axis="y", length=0)
     ax.grid(False)
-    ax.set_xlabel("from the slider joint [mm]")
+    ax.set_xlabel("from the actuated joint [mm]")
     ax.set_title(f"edges drawn {factor:g} times as thick", fontsize=8, loc="left")
 
 

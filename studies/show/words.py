@@ -28,7 +28,7 @@ def motion_text(study: Study) -> str:
     disturbances = [
         f"a pulse of {', '.join(f'{x:g}' for x in force)} {unit} on the {where}"
         for force, unit, where in (
-            (drive.pulse_force, "N", "sliders"),
+            (drive.pulse_force, "N", "actuated joints"),
             (load.pulse, "N or N m", "platform"),
         )
         if any(force)

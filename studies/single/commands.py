@@ -86,11 +86,13 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             typer.Option(help="x [m] y [m] phi [rad]; default: the first pose"),
         ] = None,
         kp: Annotated[
-            float | None, typer.Option(help="drive stiffness [N/m], 0 = free sliders")
+            float | None, typer.Option(help="drive stiffness [N/m], 0 = free drives")
         ] = None,
         kd: Annotated[float | None, typer.Option(help="drive damping [N s/m]")] = None,
         damping: Annotated[float | None, typer.Option(help="structural damping ratio [1]")] = None,
-        locked: Annotated[bool | None, typer.Option("--locked", help="hold the sliders")] = None,
+        locked: Annotated[
+            bool | None, typer.Option("--locked", help="hold the actuated joints")
+        ] = None,
         basis: Annotated[str | None, typer.Option(help="modal basis of the links")] = None,
         n_modes: Annotated[int | None, typer.Option("--modes", help="modes per link")] = None,
         as_json: AsJson = False,
@@ -174,7 +176,7 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
         "deflections: at the worst station; residual window: "
         f"{1e3 * float(windows.residual_length):.4g} ms, from "
         f"{1e3 * float(windows.residual_delay):.4g} ms after the reference trajectory"
-        + (", when the slider drive has settled to 2 %" if settled else ""),
+        + (", when the drives have settled to 2 %" if settled else ""),
         soft_wrap=True,
     )
     if text := hysteresis_text(run.study.patches.hysteresis):

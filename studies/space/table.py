@@ -207,7 +207,7 @@ def _check_samples(study: Study, columns: Columns) -> None:
 
 
 def _check_moves(study: Study, columns: Columns) -> None:
-    """Reject times of moves that a case does not have, and locked sliders with a path."""
+    """Reject times of moves that a case does not have, and locked drives with a path."""
     fields = Fields(study, columns)
     count = np.sum(~np.isnan(fields.numbers("motion.waypoints")[..., 0]), axis=1)
     for name in ("motion.move_time", "motion.dwell"):
@@ -219,7 +219,7 @@ def _check_moves(study: Study, columns: Columns) -> None:
             )
     if np.any((fields.numbers("drive.locked") > 0) & (count > 1)):
         raise StudyError(
-            "drive.locked: true in cases with more than one of motion.waypoints; locked sliders "
+            "drive.locked: true in cases with more than one of motion.waypoints; locked drives "
             "follow no path"
         )
 

@@ -112,7 +112,7 @@ class LoopBuilder:
             fault = "patches leave the link" if is_off else "patches overlap"
             return f"{plant.mismatch}: {fault}"
         if not BASES[plant.basis].is_on_chord and study.drive.locked:
-            return f"{plant.basis}: its sliders cannot be locked"
+            return f"{plant.basis}: its drives cannot be locked"
         link, joint = study.link, plant.mismatch.joint_inertia
         inertia = (link.joint_inertia_b, link.joint_inertia_c, joint or 0.0)
         if not BASES[plant.basis].has_joints and any(np.any(part) for part in inertia):

@@ -257,7 +257,7 @@ def _differs(value: Any) -> bool:
 
 
 def check_locked(study: Study) -> None:
-    """Reject a path with locked sliders, which a run cannot follow; a linearisation can.
+    """Reject a path with locked drives, which a run cannot follow; a linearisation can.
 
     Raises:
         StudyError: more than one way-point.
@@ -266,7 +266,7 @@ def check_locked(study: Study) -> None:
         raise field_error(
             "motion.waypoints",
             study.motion.waypoints,
-            "one pose where drive.locked is true: locked sliders follow no path",
+            "one pose where drive.locked is true: locked drives follow no path",
             "m, m, rad",
         )
 

@@ -38,7 +38,7 @@ class Signal(NamedTuple):
     kind: str  # a key of INPUTS or OUTPUTS
     link: int  # from 0; of the platform: its coordinate
     patch: int  # from 0
-    place: float  # from the slider's joint along the link [m], nan if it has none
+    place: float  # from the actuated joint along the link [m], nan if it has none
     angle: float = ACROSS  # of an accelerometer, from the link's axis to its normal [deg]
 
     def row(self, n_patches: int, stations: tuple[float, ...]) -> int:

@@ -133,7 +133,7 @@ class RunSection(Section):
 
 
 class MachineSection(Section):
-    """Mechanism, guides, platform, sliders."""
+    """Mechanism and platform."""
 
     kind: Annotated[str, OneOf(lambda: MECHANISMS, OWN)] = described(
         "prrr", "-", "mechanism; prrr: sliders on guides, rrr: cranks"
@@ -223,7 +223,7 @@ class LinkSection(Section):
         "constant", "-", "of further modes: same ratio, falling with frequency, or rising"
     )
     joint_inertia_b: EachLink[Annotated[float, Field(ge=0, le=1)]] = described(
-        0.0, "kg m2", "at the slider joint (basis loaded)", free=MACHINE
+        0.0, "kg m2", "at the actuated joint (basis loaded)", free=MACHINE
     )
     joint_inertia_c: EachLink[Annotated[float, Field(ge=0, le=1)]] = described(
         0.0, "kg m2", "at the platform joint (basis loaded)", free=MACHINE
@@ -517,7 +517,7 @@ class ElectronicsSection(Section):
 
 
 class DriveSection(Section):
-    """Slider servo and disturbances."""
+    """Drives and disturbances."""
 
     kind: Annotated[str, OneOf(lambda: DRIVES, OWN)] = described(
         "pd", "-", "law of the drive; those with an observer or a sliding mode are sampled"
@@ -542,11 +542,11 @@ class DriveSection(Section):
         0.0, "N", "seeded force ripple, rms, new at every sample", ge=0, le=1e3, free=MACHINE
     )
     pulse_force: OneALink[Force] = described(
-        (0.0,) * PRRR.n_links, "N", "disturbance on the sliders", free=MACHINE
+        (0.0,) * PRRR.n_links, "N", "disturbance on the actuated joints", free=MACHINE
     )
     pulse_start: float = described(0.0, "s", "its start", ge=0, le=100)
     pulse_length: float = described(0.001, "s", "its length", ge=0, le=100)
-    locked: bool = described(False, "-", "hold the sliders (bases with Y(L) = 0)")
+    locked: bool = described(False, "-", "hold the actuated joints (bases with Y(L) = 0)")
 
 
 class LoadSection(Section):

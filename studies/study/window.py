@@ -1,4 +1,4 @@
-"""Where the residual window begins if a study leaves it open: when the slider drive has settled.
+"""Where the residual window begins if a study leaves it open: when the drives have settled.
 
 A move leaves the drive's own tracking error behind, which bends the links while it settles. That
 vibration says nothing of the links or of their control, so by default the window waits for it.
@@ -147,7 +147,7 @@ def check_varied(data: Mapping[str, Any], study: Study, names: Iterable[str]) ->
 def settling_time(study: Study) -> float:
     """Time in which the drive's slowest motion decays to SETTLED [s].
 
-    The poles are those of the machine with rigid links at the last way-point, its sliders held by
+    The poles are those of the machine with rigid links at the last way-point, its drives held by
     k_p and k_d (and viscous friction): with the inertia M of the pose and the sliders' rates J X',
     each lambda of J^T J v = lambda M v is a mode s^2 + lambda k_d s + lambda k_p = 0, and of third
     order where the drive remembers. Where the drives differ from slider to slider, each is taken

@@ -34,7 +34,7 @@ from studies.verify.rows import Assumption, largest, worst
 _SAMPLES = 400
 #: Bending of a machine that is released, over its shortest link [1].
 _BENT = 5e-4
-#: Most that the two compilers' metrics may differ; locked sliders are masses of 1e9 kg, so that
+#: Most that the two compilers' metrics may differ; locked drives are masses of 1e9 kg, so that
 #: reactions to the links are small differences of large forces.
 _KERNEL, _KERNEL_LOCKED = 1e-8, 1e-5
 #: What excites every metric: a force on slider 1 at the end of the motion, on top [N].

@@ -1,4 +1,4 @@
-/* Drive of the sliders, see {{ name }}.h.
+/* Drive of the actuated joints, see {{ name }}.h.
  *
 {% for line in origin %}
  * {{ line }}

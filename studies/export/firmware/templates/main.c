@@ -50,7 +50,7 @@ static void plan(word *pose)
     pose[2] = 0;
 }
 
-/* Give the shaped pose to the inverse kinematics and the servo of the sliders. */
+/* Give the shaped pose to the inverse kinematics and the servo of the actuated joints. */
 static void command_sliders(const word *pose)
 {
     (void)pose;
