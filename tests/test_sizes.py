@@ -8,9 +8,23 @@ import pytest
 TOP = Path(__file__).parents[1]
 #: Calls whose arguments are sizes or shapes.
 SHAPED = {
-    "arange", "broadcast_to", "combinations", "empty", "eye", "full", "ndindex", "normal", "ones",
-    "permutations", "range", "repeat", "reshape", "tile", "uniform", "zeros",
-}  # fmt: skip
+    "arange",
+    "broadcast_to",
+    "combinations",
+    "empty",
+    "eye",
+    "full",
+    "ndindex",
+    "normal",
+    "ones",
+    "permutations",
+    "range",
+    "repeat",
+    "reshape",
+    "tile",
+    "uniform",
+    "zeros",
+}
 #: Mechanisms, and what is about the 3-PRR alone: the cards of papers, the coupling atlas of its
 #: links, the same machine in other codes.
 OF_ONE_MACHINE = (
