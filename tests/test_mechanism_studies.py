@@ -5,15 +5,19 @@ import os
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import studies
 from jaxmodel.mechanisms import MECHANISMS
+from jaxmodel.simulate import simulate
 from studies import sources
 from studies.cli import main
 from studies.engine.preflight import check_run
 from studies.extensions import VARIABLE, extend
+from studies.study.cases import build_structure, case_of
+from studies.study.numbers import one_study
 from studies.study.spec import Study, parse_study
 from studies.verify.machine import check_machine
 
@@ -158,3 +162,34 @@ def test_a_sweep_over_machines_of_other_sizes_is_refused(tmp_path, capsys):
         main(["sweep", str(path), "--out", str(tmp_path / "sweep")])
     assert error.value.code == 2
     assert "'five_bar'; allowed: machines of as many links: prrr, rrr" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["rrr", "five_bar"])
+def test_gradients_by_crank_and_gain_are_those_of_differences(kind):
+    """Exact derivatives of a whole controlled move, through closure and dynamics of the cranks."""
+    home = MECHANISMS[kind].home
+    study = Study().change(
+        machine__kind=kind,
+        motion__waypoints=(home, (home[0], home[1] + 0.01, *home[2:])),
+        run__duration=0.08,
+        run__smooth=True,
+        metrics__residual_length=0.02,
+        metrics__residual_delay=0.02,
+        link__modes=2,
+        control__modes=1,
+    )
+    structure, numbers = build_structure(study), one_study(study, build_structure(study))
+    names = (f"machine.kinds.{kind}.crank_length", "control.velocity_gain", "link.thickness")
+
+    @jax.jit
+    def figure(factor):
+        own = {name: numbers[name] * factor[k] for k, name in enumerate(names)}
+        metrics = simulate(structure, case_of(structure, numbers | own)).metrics
+        return 1e6 * jnp.sum(metrics.residual_rms) + 1e6 * jnp.sum(metrics.pose_error_rms[:2])
+
+    at, step = np.ones(len(names)), 1e-4
+    gradient = np.asarray(jax.jit(jax.jacfwd(figure))(at))
+    for k, unit in enumerate(np.eye(len(names))):
+        a, b, c, d = (float(figure(at + place * step * unit)) for place in (-2, -1, 1, 2))
+        assert gradient[k] == pytest.approx((a - 8 * b + 8 * c - d) / (12 * step), rel=1e-6)
+        assert abs(gradient[k]) > 1e-6
