@@ -11,6 +11,7 @@ import pytest
 import studies
 from jaxmodel.mechanisms import MECHANISMS
 from studies import sources
+from studies.atlas import drawing
 from studies.cli import main
 from studies.engine.preflight import check_run
 from studies.extensions import VARIABLE, extend
@@ -121,9 +122,16 @@ def test_a_mechanism_of_ones_own_has_the_accelerations_of_its_lagrangian(gantry)
 
 
 def test_modes_of_two_links_are_named(gantry):
-    modes = studies.machine_modes(Study().change(machine__kind=gantry, link__modes=2))
+    study = Study().change(machine__kind=gantry, link__modes=2)
+    modes = studies.machine_modes(study)
     assert modes.link_share.shape[1:] == (2, 2)
     assert np.all(np.isfinite(modes.frequency)) and len(modes.frequency) == 6
+    bending = modes.shape[:, 2].real
+    parts = drawing.mode_skeleton(study, np.array(study.motion.waypoints[0]), bending)
+    assert parts.slider.shape == (3, 2, 2)
+    # drawn as far to either side as the larger of both bends
+    moved = np.abs(parts.link[1:] - parts.link[0]).max()
+    assert 0.05 < moved / study.link.length < 0.2
 
 
 def test_defaults_follow_the_mechanism_and_what_was_given_stays():
