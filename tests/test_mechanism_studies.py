@@ -150,6 +150,10 @@ def test_defaults_follow_the_mechanism_and_what_was_given_stays():
         ({"motion": {"waypoints": [[0.0, 0.25, 0.0]]}}, "waypoints.0 = .*allowed: 2 finite"),
         ({"link": {"length": [0.2, 0.2, 0.2]}}, "link.length.*or a list of 2"),
         ({"load": {"inertia": 1e-3}}, "load.inertia = 0.001; allowed: 0: the platform is a point"),
+        (
+            {"machine": {"kind": "five_bar", "kinds": {"five_bar": {"crank_length": [0.2] * 3}}}},
+            r"five_bar.crank_length = \[0.2.*allowed: a finite number, or a list of 2",
+        ),
         ({"motion": {"waypoints": [[0.0, 0.6]]}}, "0.6.*reach each joint.*0.608.*pivot"),
     ],
 )
