@@ -12,7 +12,7 @@ class PartError(ValueError):
 
 class Parameter(NamedTuple):
     """An entry's own field in the study file, `[control.laws.NAME]`,
-    `[drive.kinds.NAME]` or `[machine.kinds.NAME]`; one number, or three."""
+    `[drive.kinds.NAME]` or `[machine.kinds.NAME]`; one number, or one a link."""
 
     name: str
     default: float

@@ -13,6 +13,7 @@ import studies
 from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.simulate import simulate
 from studies import sources
+from studies.atlas import drawing
 from studies.cli import main
 from studies.engine.preflight import check_run
 from studies.extensions import VARIABLE, extend
@@ -125,9 +126,16 @@ def test_a_mechanism_of_ones_own_has_the_accelerations_of_its_lagrangian(gantry)
 
 
 def test_modes_of_two_links_are_named(gantry):
-    modes = studies.machine_modes(Study().change(machine__kind=gantry, link__modes=2))
+    study = Study().change(machine__kind=gantry, link__modes=2)
+    modes = studies.machine_modes(study)
     assert modes.link_share.shape[1:] == (2, 2)
     assert np.all(np.isfinite(modes.frequency)) and len(modes.frequency) == 6
+    bending = modes.shape[:, 2].real
+    parts = drawing.mode_skeleton(study, np.array(study.motion.waypoints[0]), bending)
+    assert parts.near.shape == (3, 2, 2)
+    # drawn as far to either side as the larger of both bends
+    moved = np.abs(parts.link[1:] - parts.link[0]).max()
+    assert 0.05 < moved / study.link.length < 0.2
 
 
 def test_defaults_follow_the_mechanism_and_what_was_given_stays():
@@ -146,6 +154,10 @@ def test_defaults_follow_the_mechanism_and_what_was_given_stays():
         ({"motion": {"waypoints": [[0.0, 0.25, 0.0]]}}, "waypoints.0 = .*allowed: 2 finite"),
         ({"link": {"length": [0.2, 0.2, 0.2]}}, "link.length.*or a list of 2"),
         ({"load": {"inertia": 1e-3}}, "load.inertia = 0.001; allowed: 0: the platform is a point"),
+        (
+            {"machine": {"kind": "five_bar", "kinds": {"five_bar": {"crank_length": [0.2] * 3}}}},
+            r"five_bar.crank_length = \[0.2.*allowed: a finite number, or a list of 2",
+        ),
         ({"motion": {"waypoints": [[0.0, 0.6]]}}, "0.6.*reach each joint.*0.608.*pivot"),
     ],
 )
@@ -193,3 +205,19 @@ def test_gradients_by_crank_and_gain_are_those_of_differences(kind):
         a, b, c, d = (float(figure(at + place * step * unit)) for place in (-2, -1, 1, 2))
         assert gradient[k] == pytest.approx((a - 8 * b + 8 * c - d) / (12 * step), rel=1e-6)
         assert abs(gradient[k]) > 1e-6
+
+
+@pytest.mark.parametrize(
+    ("axes", "message"),
+    [
+        ({"machine.kinds.rrr.crank_length": [0.15, 12.0]}, "crank_length = 12.0; allowed: 0.001"),
+        (
+            {"machine.kind": ["rrr", "prrr"]},
+            "'prrr' has its home elsewhere; write motion.waypoints",
+        ),
+    ],
+)
+def test_axes_that_no_machine_can_have_are_refused(axes, message):
+    with pytest.raises(studies.StudyError, match=message):
+        spec = studies.parse_sweep({"machine": {"kind": "rrr"}, "sweep": {"axes": axes}})
+        studies.make_plan(spec)

@@ -41,6 +41,7 @@ def test_there_are_notebooks():
         "5_spillover",
         "6_from_design_to_c",
         "7_python_control",
+        "8_other_machines",
     ]
 
 

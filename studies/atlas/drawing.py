@@ -67,18 +67,18 @@ def mode_skeleton(study: Study, pose: np.ndarray, shape: np.ndarray) -> Skeleton
 
     Args:
         study: the machine.
-        pose: at rest [m, m, rad], (p,).
-        shape: of the mode over (X, q), (p + n R,).
+        pose: at rest [m, m, rad], (n,) coordinates.
+        shape: of the mode over (X, q), (n + links x R,).
     """
-    count = study.n_pose
-    length, q = study.each_link(study.link.length).min(), shape[count:].reshape(study.n_links, -1)
-    scale = [1, 1, study.each_link(study.machine.joint_radius).mean()][:count]
-    size = np.abs(shape[:count]) * scale
+    n, length = study.n_pose, study.each_link(study.link.length).min()
+    q = shape[n:].reshape(study.n_links, -1)
+    arm = study.each_link(study.machine.joint_radius).mean()
+    size = np.abs(shape[:n]) * np.array([1, 1, arm])[:n]
     factor = min(
         DRAWN * length / max(np.abs(q).max(), 1e-300), DRAWN_POSE * length / max(size.max(), 1e-300)
     )
     phases = np.array([0.0, 1.0, -1.0])
-    moved = pose + factor * phases[:, None] * shape[:count]
+    moved = pose + factor * phases[:, None] * shape[:n]
     return skeleton(study, moved, factor * phases[:, None, None] * q, 1.0)
 
 

@@ -72,15 +72,24 @@ def check_consistency(study: Study) -> None:
     _check_poles(study)
     check_system(study, n_patches)
     _check_lists(study)
-    _check_own_fields("control.laws", control.laws, LAWS)
-    _check_own_fields("drive.kinds", study.drive.kinds, DRIVES)
-    _check_own_fields("machine.kinds", study.machine.kinds, MECHANISMS)
+    check_own_fields(study)
     _check_mechanism(study)
     _check_basis(study)
     _check_stations(study)
     _check_sampling(study)
     _check_pulses(study)
     _check_coupling(study)
+
+
+def check_own_fields(study: Study) -> None:
+    """Check the own fields of laws, drives and mechanisms.
+
+    Raises:
+        StudyError: one that there is not, or a number out of its bounds.
+    """
+    _check_own_fields("control.laws", study.control.laws, LAWS)
+    _check_own_fields("drive.kinds", study.drive.kinds, DRIVES)
+    _check_own_fields("machine.kinds", study.machine.kinds, MECHANISMS)
 
 
 def _check_mechanism(study: Study) -> None:

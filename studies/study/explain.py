@@ -61,8 +61,11 @@ def allowed_values(
         mark = _mark(_limits(arguments[-1]))
         is_number = depth(arguments[0]) == 0
         if mark and is_number and get_args(arguments[-1])[0] == tuple[arguments[0], ...]:  # type: ignore[valid-type]
-            inner, limits = get_args(arguments[0])[0], _range(_limits(arguments[0]))
-            return f"{_WORDS[inner]}, or a list of {_count(mark, sizes)}, each {limits}"
+            number = arguments[0]
+            inner = get_args(number)[0] if hasattr(number, "__metadata__") else number
+            limits = _range(_limits(number))
+            each = f", each {limits}" if limits else ""
+            return f"{_WORDS[inner]}, or a list of {_count(mark, sizes)}{each}"
         return ", or ".join(allowed_values(each, metadata, sizes) for each in arguments)
     if origin is dict:
         return f"a table{' of one entry or more' if _bound(metadata, 'min_length') else ''}"

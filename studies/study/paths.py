@@ -23,7 +23,7 @@ from jaxmodel.mechanisms.contract import Mechanism
 from jaxmodel.mechanisms.prrr import PRRR
 from jaxmodel.table import Parameter
 from studies.errors import StudyError, field_error, nearest, shown
-from studies.study.consistency import check_consistency
+from studies.study.consistency import check_consistency, check_own_fields
 from studies.study.explain import choices_of, unit_of
 from studies.study.sizes import alternatives, depth, has_one_a_link
 from studies.study.spec import (
@@ -264,16 +264,28 @@ def checked_value(study: Study, name: str, value: Any, path: str) -> Any:
     data = set_value(study, name, as_tuples(value))
     try:
         changed = validate(data)
+        check_own_fields(changed)
         if not name.startswith(JUDGED_BY_STATUS):
             check_consistency(changed)
     except ValidationError as error:
         raise StudyError(f"{path}: {explained(error, data)}") from None
     except StudyError as error:
         raise StudyError(f"{path}: {error}") from None
+    if name == "machine.kind":
+        _check_exchange(study, changed, path)
+    return known_field(name, changed)
+
+
+def _check_exchange(study: Study, changed: Study, path: str) -> None:
+    """Refuse another mechanism in a batch whose other fields do not suit it."""
+    kind = changed.machine.kind
     if (changed.n_links, changed.n_pose) != (study.n_links, study.n_pose):
         alike = [x.name for x in MECHANISMS.values() if x.n_links == study.n_links]
-        raise field_error(path, value, f"machines of as many links: {', '.join(alike)}")
-    return known_field(name, changed)
+        raise field_error(path, kind, f"machines of as many links: {', '.join(alike)}")
+    if changed.motion.waypoints != study.motion.waypoints:
+        raise StudyError(
+            f"{path}: {kind!r} has its home elsewhere; write motion.waypoints that suit all"
+        )
 
 
 def overlaps(name: str, other: str) -> bool:

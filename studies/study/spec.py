@@ -136,7 +136,7 @@ class MachineSection(Section):
     """Mechanism and platform."""
 
     kind: Annotated[str, OneOf(lambda: MECHANISMS, OWN)] = described(
-        "prrr", "-", "mechanism; prrr: sliders on guides, rrr: cranks"
+        "prrr", "-", "mechanism; prrr: sliders on guides; rrr, five_bar: cranks"
     )
     kinds: Annotated[dict[str, dict[str, EachLink[float]]], OwnFields(OWN_MECHANISMS)] = described(
         {}, "-", "fields of the mechanisms, by kind"
