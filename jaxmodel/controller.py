@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from jaxmodel.channels import Channels
 from jaxmodel.estimator import FilterState
 from jaxmodel.lazy import jax, jnp
@@ -32,6 +34,22 @@ class Controller(NamedTuple):
     adc_top: Array  # highest code [1], ()
     adc_noise: Array  # rms at the ADC input [V], ()
     notch: Notch | None = None  # before the feedback; None: there is none
+
+
+class ChannelParts(NamedTuple):
+    """What the channels of a controller read and drive; a linear system has none, C = 0."""
+
+    filter: Array  # channel signal per sensor volt, (n, C, K)
+    synthesizer: Array  # actuator volts per channel force, (n, K, C)
+
+
+def channel_parts(controller: Controller) -> ChannelParts:
+    """Of either kind of feedback."""
+    feedback = controller.feedback
+    if isinstance(feedback, Channels):
+        return ChannelParts(feedback.filter, feedback.synthesizer)
+    links, patches = controller.feedthrough.shape[:2]
+    return ChannelParts(np.zeros((links, 0, patches)), np.zeros((links, patches, 0)))
 
 
 class ControllerState(NamedTuple):

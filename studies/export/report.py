@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from jaxmodel.controller import Feedback
-from jaxmodel.state_space import StateSpace
+from jaxmodel.controller import channel_parts
 from studies.engine.controller import FixedController
 from studies.export.c_fixed import format_lines
 from studies.export.firmware.boards import CLOCKS
@@ -54,20 +53,13 @@ def report(exported: FixedController, origin: list[str], result: ExportResult) -
         ],
         controllers=_controllers(exported, verified),
         code=code,
-        deflection=code * _largest_deflection(controller.feedback),
+        deflection=code * np.abs(channel_parts(controller).filter[:, :1]).max(initial=0.0),
         fixed=fixed,
         cost=result.cost,
         target=result.on_target,
         **(_of_target(exported, result.on_target) if result.on_target is not None else {}),
         **(_of_fixed(exported, fixed, verified) if fixed is not None else {}),
     )
-
-
-def _largest_deflection(feedback: Feedback) -> float:
-    """Modal deflection of mode 1 per sensor volt [m/V]; 0 without modes."""
-    if isinstance(feedback, StateSpace):
-        return 0.0
-    return float(np.abs(feedback.filter[:, :1]).max(initial=0.0))
 
 
 def _controllers(exported: FixedController, verified: Verification) -> list[list[str]]:

@@ -7,9 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.beam import BASES
-from jaxmodel.controller import linear_parts
+from jaxmodel.controller import channel_parts, linear_parts
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
-from jaxmodel.state_space import StateSpace
 from studies.engine.breaking import BreakingChange
 from studies.engine.controller import FixedController, fixed_controller
 from studies.engine.host_loop import SampledLoop, name_motion
@@ -246,8 +245,7 @@ def _certificate(
     shape, largest = plants.shape, max(plant.n_modes for plant in plants.ravel())
     exists = faults == ""
     law = pad_channels(design.controller, design.n_patches)
-    feedback, links = design.controller.feedback, design.structure.n_links
-    channels = 0 if isinstance(feedback, StateSpace) else feedback.acting.shape[1]
+    links, channels, _ = channel_parts(design.controller).filter.shape
 
     radius, limit = np.full((2, *shape), np.nan)
     frequency, zeta, free = np.full((3, *shape, largest, links), np.nan)

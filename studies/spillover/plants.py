@@ -15,15 +15,13 @@ import numpy as np
 
 from jaxmodel.beam import BASES
 from jaxmodel.case import Case, Structure
-from jaxmodel.controller import Controller, Feedback
+from jaxmodel.controller import Controller, channel_parts
 from jaxmodel.laws.srf import SRF
 from jaxmodel.linear import resting
-from jaxmodel.loop import Loop
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import placement_faults
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopMatrices, loop_matrices
-from jaxmodel.state_space import StateSpace
 from studies.engine.controller import FixedController
 from studies.engine.host_loop import SampledLoop, sampled_loop
 from studies.engine.programs import kept_jit
@@ -205,22 +203,15 @@ def _evaluate_loop(
     structure: Structure, case: Case, pose: Array, law: Controller
 ) -> tuple[LoopMatrices, Array, SpilloverGains]:
     loop = prepare(structure, case).loop
-    gains = _gains(loop, law.feedback)
+    channels = channel_parts(law)
+    force = loop.plant.modal_mass[:, None, None] * loop.actuator
+    gains = SpilloverGains(
+        jnp.einsum("ick,ikr->icr", channels.filter, loop.sensor),
+        jnp.einsum("irk,ikc->irc", force, channels.synthesizer),
+    )
     at_rest = resting(structure, case)
     matrices = loop_matrices(structure, case, loop, law, pose, at_rest)
     return matrices, loop.omega, gains
-
-
-def _gains(loop: Loop, feedback: Feedback) -> SpilloverGains:
-    """Of its channels, of which a linear system has none."""
-    if isinstance(feedback, StateSpace):
-        links, modes = loop.omega.shape
-        return SpilloverGains(jnp.zeros((links, 0, modes)), jnp.zeros((links, modes, 0)))
-    force = loop.plant.modal_mass[:, None, None] * loop.actuator
-    return SpilloverGains(
-        jnp.einsum("ick,ikr->icr", feedback.filter, loop.sensor),
-        jnp.einsum("irk,ikc->irc", force, feedback.synthesizer),
-    )
 
 
 def _kept_states(

@@ -94,7 +94,7 @@ def check_own_fields(study: Study) -> None:
 
 def _check_mechanism(study: Study) -> None:
     """Reject fields that the study's mechanism does not read."""
-    mechanism, machine = MECHANISMS[study.machine.kind], study.machine
+    mechanism, machine = study.mechanism, study.machine
     solid = {"platform_inertia"} if mechanism.n_pose == 3 else set()
     read = {"kind", "kinds", "platform_mass", *solid, *mechanism.reads}
     for leaf, info in type(machine).model_fields.items():

@@ -18,14 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.case import Structure
-from jaxmodel.drives import DRIVES
-from jaxmodel.laws import LAWS
 from jaxmodel.laws.state_space import STATE_SPACE
-from jaxmodel.mechanisms import MECHANISMS
 from studies.study.fields import Columns, Fields, nesting
-from studies.study.paths import all_fields, field_choices, own_fields, own_place, parse_entry
+from studies.study.paths import Parts, all_fields, field_choices, own_fields, own_place, parse_entry
 from studies.study.sizes import alternatives, depth, has_one_a_link
-from studies.study.spec import OWN_DRIVES, OWN_LAWS, OWN_MECHANISMS, Study
+from studies.study.spec import OWN_FIELDS, Study
 from studies.study.state_space import system_of
 from studies.study.window import DELAY, residual_delay
 
@@ -82,12 +79,9 @@ def study_numbers(study: Study, structure: Structure, columns: Columns | None = 
         for name in all_fields()
         if name != DELAY and not own_place(name) and not name.startswith("state_space.")
     }
-    own = [
-        *own_fields(OWN_LAWS, [LAWS[structure.law]]),
-        *own_fields(OWN_DRIVES, [DRIVES[structure.drive]]),
-        *own_fields(OWN_MECHANISMS, [MECHANISMS[structure.mechanism]]),
-    ]
-    numbers |= {name: fields.each_link(name) for name in own}
+    chosen = Parts(structure.law, structure.drive, structure.mechanism)
+    for (place, table), name in zip(OWN_FIELDS.items(), chosen, strict=True):
+        numbers |= {own: fields.each_link(own) for own in own_fields(place, [table[name]])}
     # "auto" is that of the study without columns
     is_given = DELAY in fields.columns
     numbers[DELAY] = fields.numbers(DELAY) if is_given else np.array([residual_delay(study)])

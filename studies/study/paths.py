@@ -14,9 +14,7 @@ from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ValidationError
 
-from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import DriveLaw
-from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law
 from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.mechanisms.contract import Mechanism
@@ -27,10 +25,7 @@ from studies.study.consistency import check_consistency, check_own_fields
 from studies.study.explain import choices_of, unit_of
 from studies.study.sizes import alternatives, depth, has_one_a_link
 from studies.study.spec import (
-    OWN_DRIVES,
     OWN_FIELDS,
-    OWN_LAWS,
-    OWN_MECHANISMS,
     Study,
     explained,
     validate,
@@ -55,7 +50,7 @@ JUDGED_BY_STATUS = (
 
 
 class Parts(NamedTuple):
-    """The exchangeable parts of a study; each combination has its own program."""
+    """The exchangeable parts of a study, in the order of `OWN_FIELDS`; each has its own program."""
 
     law: str  # of LAWS
     drive: str  # of DRIVES
@@ -64,8 +59,9 @@ class Parts(NamedTuple):
     def owns(self, field: str) -> bool:
         """Whether a field is none of a law, drive or mechanism that is not among these."""
         place = own_place(field)
-        names = {OWN_LAWS: self.law, OWN_DRIVES: self.drive, OWN_MECHANISMS: self.mechanism}
-        return not place or field.startswith(f"{place}.{names[place]}.")
+        return not place or field.startswith(
+            f"{place}.{dict(zip(OWN_FIELDS, self, strict=True))[place]}."
+        )
 
 
 def parts_of(study: Study, changed: Mapping[str, Any] | None = None) -> Parts:
@@ -176,10 +172,9 @@ def free_fields(parts: Iterable[Parts], *roles: str) -> tuple[str, ...]:
         for leaf, info in getattr(outer.annotation, "model_fields", {}).items()
         if isinstance(info.json_schema_extra, dict) and info.json_schema_extra.get("free") in roles
     ]
-    laws, drives, mechanisms = (dict.fromkeys(x) for x in zip(*parts, strict=True))
-    own = own_fields(OWN_LAWS, [LAWS[name] for name in laws])
-    own += own_fields(OWN_DRIVES, [DRIVES[name] for name in drives])
-    return (*names, *own, *own_fields(OWN_MECHANISMS, [MECHANISMS[name] for name in mechanisms]))
+    for (place, table), chosen in zip(OWN_FIELDS.items(), zip(*parts, strict=True), strict=True):
+        names += own_fields(place, [table[name] for name in dict.fromkeys(chosen)])
+    return tuple(names)
 
 
 def as_list(field: str, value: Any, n_links: int) -> Any:
@@ -264,9 +259,8 @@ def checked_value(study: Study, name: str, value: Any, path: str) -> Any:
     data = set_value(study, name, as_tuples(value))
     try:
         changed = validate(data)
-        check_own_fields(changed)
-        if not name.startswith(JUDGED_BY_STATUS):
-            check_consistency(changed)
+        is_judged = name.startswith(JUDGED_BY_STATUS)
+        (check_own_fields if is_judged else check_consistency)(changed)
     except ValidationError as error:
         raise StudyError(f"{path}: {explained(error, data)}") from None
     except StudyError as error:

@@ -6,7 +6,7 @@ not given has a default of its own.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from functools import cache
 from types import UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
@@ -105,12 +105,14 @@ def for_mechanism(data: dict[str, Any], model: type[BaseModel], old: Mechanism) 
     return data
 
 
-def _marked(model: type[BaseModel]) -> Iterator[tuple[tuple[str, str], tuple[Any, ...], str]]:
+@cache
+def _marked(model: type[BaseModel]) -> tuple[tuple[tuple[str, str], tuple[Any, ...], str], ...]:
     """Fields whose default is a marked list: (section, leaf), default, what it counts."""
+    found: list[tuple[tuple[str, str], tuple[Any, ...], str]] = []
     for section, outer in model.model_fields.items():
         for leaf, info in getattr(outer.annotation, "model_fields", {}).items():
             if (section, leaf) == PATH:
-                yield PATH, info.default, COORDINATE.of
+                found.append((PATH, info.default, COORDINATE.of))
             elif isinstance(info.default, tuple):
                 marks = [x for x in info.metadata if isinstance(x, OneEach)]
                 for one in alternatives(info.annotation):
@@ -119,7 +121,8 @@ def _marked(model: type[BaseModel]) -> Iterator[tuple[tuple[str, str], tuple[Any
                             x for x in getattr(one, "__metadata__", ()) if isinstance(x, OneEach)
                         ]
                 if marks:
-                    yield (section, leaf), info.default, marks[0].of
+                    found.append(((section, leaf), info.default, marks[0].of))
+    return tuple(found)
 
 
 def _levels(value: Any) -> int:

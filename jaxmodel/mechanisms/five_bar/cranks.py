@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxmodel.lazy import jnp
 from jaxmodel.mechanisms.carriers import Crank, cranks
-from jaxmodel.mechanisms.rrr.cranks import Cranks
+from jaxmodel.mechanisms.rrr.cranks import CRANK_PARAMETERS, Cranks, crank_legs
 from jaxmodel.parameters import Array
 from jaxmodel.table import Parameter
 
@@ -30,27 +30,21 @@ class FiveBarGeometry(NamedTuple):
 
     def carriers(self, near_mass: Array, xp: Any = np) -> tuple[Crank, ...]:
         """The crank on the left, and that on the right."""
-        x = xp.asarray([-1.0, 1.0]) * xp.asarray(self.pivot_distance)
-        pivots = xp.stack([x, xp.zeros(2)], axis=1)
+        pivots = xp.stack(self._pivots(xp), axis=1)
         return cranks(pivots, self.crank_length, self.zero_angle, self.elbow, near_mass, xp)
 
     def legs(self, xp: Any = jnp) -> Cranks:
         """A_1 on the left, A_2 on the right."""
-        zero = xp.asarray(self.zero_angle)
-        return Cranks(
-            x=xp.asarray([-1.0, 1.0]) * xp.asarray(self.pivot_distance),
-            y=xp.zeros(2),
-            length=xp.broadcast_to(xp.asarray(self.crank_length), zero.shape),
-            elbow=xp.asarray(self.elbow),
-            zero_x=xp.cos(zero),
-            zero_y=xp.sin(zero),
-        )
+        x, y = self._pivots(xp)
+        return crank_legs(x, y, self.crank_length, self.elbow, self.zero_angle, xp)
+
+    def _pivots(self, xp: Any) -> tuple[Array, Array]:
+        return xp.asarray([-1.0, 1.0]) * xp.asarray(self.pivot_distance), xp.zeros(2)
 
 
 PARAMETERS = (
     Parameter("pivot_distance", 0.1, "m", "distance of the pivot from the origin", 0.005, 5.0),
-    Parameter("crank_length", 0.16, "m", "of the crank", 1e-3, 10.0),
-    Parameter("crank_inertia", 4e-3, "kg m2", "of crank and motor about the pivot", 1e-8, 1e3),
+    *CRANK_PARAMETERS,
 )
 
 

@@ -71,6 +71,26 @@ class Cranks(NamedTuple):
         ]
 
 
+def crank_legs(x: Array, y: Array, length: Array, elbow: Array, zero: Array, xp: Any) -> Cranks:
+    """Cranks of one length and elbow, or each of its own.
+
+    Args:
+        x, y: of the pivots [m], (n,).
+        length: a [m], () or (n,).
+        elbow: see `Cranks`, () or (n,).
+        zero: direction of a crank at rho = 0 [rad], (n,).
+        xp: NumPy or `jax.numpy`.
+    """
+    zero = xp.asarray(zero)
+
+    def link(x: Array) -> Array:
+        return xp.broadcast_to(xp.asarray(x), zero.shape)
+
+    return Cranks(
+        x=x, y=y, length=link(length), elbow=link(elbow), zero_x=xp.cos(zero), zero_y=xp.sin(zero)
+    )
+
+
 class CrankGeometry(NamedTuple):
     """Cranks about pivots on a circle around O, and platform joints."""
 
@@ -97,29 +117,21 @@ class CrankGeometry(NamedTuple):
 
     def legs(self, xp: Any = jnp) -> Cranks:
         """A_i = r_i (cos, sin) of the pivot's direction."""
-        zero = xp.asarray(self.zero_angle)
         x, y = polar(self.pivot_radius, self.pivot_angle, xp)
-
-        def link(x: Array) -> Array:
-            return xp.broadcast_to(xp.asarray(x), zero.shape)
-
-        return Cranks(
-            x=x,
-            y=y,
-            length=link(self.crank_length),
-            elbow=link(self.elbow),
-            zero_x=xp.cos(zero),
-            zero_y=xp.sin(zero),
-        )
+        return crank_legs(x, y, self.crank_length, self.elbow, self.zero_angle, xp)
 
 
 #: Directions of the pivots from O that `pivot_turn` counts from [deg].
 DIRECTIONS = (90.0, 210.0, 330.0)
+#: Of every crank.
+CRANK_PARAMETERS = (
+    Parameter("crank_length", 0.16, "m", "of the crank", 1e-3, 10.0),
+    Parameter("crank_inertia", 4e-3, "kg m2", "of crank and motor about the pivot", 1e-8, 1e3),
+)
 PARAMETERS = (
     Parameter("pivot_radius", 0.3, "m", "distance of the pivot from the origin", 0.01, 10.0),
     Parameter("pivot_turn", 0.0, "deg", "pivot's direction from 90, 210, 330 deg", -180.0, 180.0),
-    Parameter("crank_length", 0.16, "m", "of the crank", 1e-3, 10.0),
-    Parameter("crank_inertia", 4e-3, "kg m2", "of crank and motor about the pivot", 1e-8, 1e3),
+    *CRANK_PARAMETERS,
     Parameter("elbow", 1.0, "1", "1: the link lies to the left of the crank, -1: right", -1.0, 1.0),
 )
 
