@@ -156,7 +156,7 @@ def table_of(examples):
     }
     n = len(rows)
     zero = np.zeros(n, int)
-    return CaseTable(default, columns, zero, zero.astype("S16"), zero, 0, np.arange(n))
+    return CaseTable(default, columns, zero, zero.astype("S16"), zero, 0, np.arange(n), np.arange(n))
 
 
 @pytest.fixture(scope="module")

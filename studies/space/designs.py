@@ -1,8 +1,14 @@
-"""How axes combine: from the tree of blocks to columns of values, one row per case."""
+"""How axes combine: from the tree of blocks to columns of values, one row per case.
+
+A design has any number of cases, since only those are made that are asked for: all of a sweep, some
+at a time of a screen.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,8 +21,16 @@ from studies.study.paths import checked_value, known_field
 from studies.study.spec import Study
 
 
-def spread(node: BlockNode, study: Study, seed: int, stride: int = 1000) -> Columns:
-    """Expand a block to columns: what varies, one row per case; {} for a block without axes.
+class Design(NamedTuple):
+    """Cases as they are written, made only when they are asked for."""
+
+    names: tuple[str, ...]  # of the columns
+    size: int
+    rows: Callable[[np.ndarray], Columns]  # of these numbers, from 0, ascending, (n,)
+
+
+def design_of(node: BlockNode, study: Study, seed: int, stride: int = 1000) -> Design:
+    """The cases of a block; without axes one, without columns.
 
     Args:
         node: the block.
@@ -25,22 +39,31 @@ def spread(node: BlockNode, study: Study, seed: int, stride: int = 1000) -> Colu
         stride: between the seeds of its blocks; theirs is larger, so that none has another's seed.
 
     Raises:
-        StudyError: a bad axis, a name used twice, too many cases.
+        StudyError: a bad axis, or a name used twice.
     """
-    method, own = METHODS[node.block.method], None
+    method = METHODS[node.block.method]
     if node.block.cases:
-        own = _list_cases(node, study)
+        parts = [_stored(_list_cases(node, study))]
     elif method.points is not None:
-        own = _sample(node, study, seed)
-    parts = [own] if own is not None else [_grid_of(a, n) for n, a in _axes(node, study).items()]
+        parts = [_sampled(node, study, seed)]
+    else:
+        parts = [_grid_of(axis, path) for path, axis in _axes(node, study).items()]
     parts += [
-        spread(child, study, seed + stride * (k + 1), 1000 * stride)
+        design_of(child, study, seed + stride * (k + 1), 1000 * stride)
         for k, child in enumerate(node.children)
     ]
     _check_names(parts, node.path)
     if method.combine == "side by side":
-        return _zip_columns(parts, node.path)
-    return _product(parts, node.path)
+        return _zipped(parts, node.path)
+    return _product(parts)
+
+
+def _stored(columns: Columns) -> Design:
+    return Design(
+        tuple(columns),
+        length(columns),
+        lambda rows: {name: column[rows] for name, column in columns.items()},
+    )
 
 
 def _axes(node: BlockNode, study: Study) -> dict[str, Axis]:
@@ -51,12 +74,12 @@ def _axes(node: BlockNode, study: Study) -> dict[str, Axis]:
     }
 
 
-def _grid_of(axis: Axis, path: str) -> Columns:
+def _grid_of(axis: Axis, path: str) -> Design:
     if axis.grid is None:
         raise StudyError(
             f"{path}: a range needs count (placement: candidates) for methods grid and zip"
         )
-    return axis.grid
+    return _stored(axis.grid)
 
 
 def length(columns: Columns) -> int:
@@ -64,10 +87,10 @@ def length(columns: Columns) -> int:
     return len(next(iter(columns.values()))) if columns else 1
 
 
-def _check_names(parts: list[Columns], path: str) -> None:
+def _check_names(parts: list[Design], path: str) -> None:
     seen: set[str] = set()
-    for columns in parts:
-        for name in columns:
+    for part in parts:
+        for name in part.names:
             if name in seen:
                 raise StudyError(f"{path}: {name} varies twice; let one axis or block vary it")
             seen.add(name)
@@ -77,29 +100,41 @@ def _check_names(parts: list[Columns], path: str) -> None:
             raise StudyError(f"{path}: {whole} varies as a whole and by its entry {name}")
 
 
-def _zip_columns(parts: list[Columns], path: str) -> Columns:
-    sizes = [length(columns) for columns in parts]
+def _zipped(parts: list[Design], path: str) -> Design:
+    sizes = [part.size for part in parts]
     if len(set(sizes)) > 1:
-        named = ", ".join(
-            f"{'/'.join(columns)}: {size}" for columns, size in zip(parts, sizes, strict=True)
-        )
+        named = ", ".join(f"{'/'.join(part.names)}: {part.size}" for part in parts)
         raise StudyError(f"{path}: axes of one length side by side; here {named}")
-    return {name: column for columns in parts for name, column in columns.items()}
+    return Design(
+        _names(parts),
+        sizes[0] if sizes else 1,
+        lambda rows: {name: x for part in parts for name, x in part.rows(rows).items()},
+    )
 
 
-def _product(parts: list[Columns], path: str) -> Columns:
-    sizes = [length(columns) for columns in parts]
-    total = int(np.prod([float(size) for size in sizes]))
-    if total > LIMIT:
-        raise StudyError(f"{path}: {total:.3g} cases; allowed: up to {LIMIT}")
-    result: dict[str, np.ndarray] = {}
-    inner, outer = total, 1
-    for columns, size in zip(parts, sizes, strict=True):
-        inner //= size
-        index = np.tile(np.repeat(np.arange(size), inner), outer)
-        outer *= size
-        result |= {name: column[index] for name, column in columns.items()}
-    return result
+def _product(parts: list[Design]) -> Design:
+    """Every combination; the last part varies fastest."""
+
+    def rows_of(rows: np.ndarray) -> Columns:
+        result, inner = {}, math.prod(part.size for part in parts)
+        for part in parts:
+            inner //= part.size
+            result |= _some(part, rows // inner % part.size)
+        return result
+
+    return Design(_names(parts), math.prod(part.size for part in parts), rows_of)
+
+
+def _some(part: Design, rows: np.ndarray) -> Columns:
+    """Rows of a part, in any order and as often as named."""
+    distinct, where = np.unique(rows, return_inverse=True)
+    if len(distinct) == len(rows) and np.all(rows[:-1] < rows[1:]):
+        return part.rows(rows)
+    return {name: column[where] for name, column in part.rows(distinct).items()}
+
+
+def _names(parts: list[Design]) -> tuple[str, ...]:
+    return tuple(name for part in parts for name in part.names)
 
 
 def _list_cases(node: BlockNode, study: Study) -> Columns:
@@ -124,35 +159,67 @@ def _list_cases(node: BlockNode, study: Study) -> Columns:
     return columns
 
 
-def _sample(node: BlockNode, study: Study, seed: int) -> Columns:
-    axes = _axes(node, study)
+def _sampled(node: BlockNode, study: Study, seed: int) -> Design:
+    axes, method = _axes(node, study), METHODS[node.block.method]
     dimensions = sum(axis.dimensions for axis in axes.values())
-    points = unit_points(node, dimensions, seed)
-    columns: dict[str, np.ndarray] = {}
-    at = 0
-    for path, axis in axes.items():
-        part = axis.sample(points[:, at : at + axis.dimensions])
-        for name in part:
-            if name in columns:
-                raise StudyError(f"{path}: {name} varies twice; let one axis vary it")
-        columns |= part
-        at += axis.dimensions
-    return columns
+
+    def at(points: np.ndarray) -> Columns:
+        columns: dict[str, np.ndarray] = {}
+        begin = 0
+        for path, axis in axes.items():
+            part = axis.sample(points[:, begin : begin + axis.dimensions])
+            for name in part:
+                if name in columns:
+                    raise StudyError(f"{path}: {name} varies twice; let one axis vary it")
+            columns |= part
+            begin += axis.dimensions
+        return columns
+
+    names = tuple(at(np.full((1, dimensions), 0.5)))
+    if not method.is_streamed:
+        every = unit_points(node, dimensions, seed)
+        return Design(names, len(every), lambda rows: at(every[rows]))
+
+    def rows_of(rows: np.ndarray) -> Columns:
+        first, stop = int(rows[0]), int(rows[-1]) + 1
+        if stop - first > LIMIT:
+            raise StudyError(
+                f"{node.path}: {stop - first} points at once; allowed: up to {LIMIT}. Let the "
+                "block with the most points be the outermost one"
+            )
+        return at(unit_points(node, dimensions, seed, (first, stop))[rows - first])
+
+    return Design(names, node.block.count, rows_of)
 
 
-def unit_points(node: BlockNode, dimensions: int, seed: int) -> np.ndarray:
+def unit_points(
+    node: BlockNode, dimensions: int, seed: int, span: tuple[int, int] | None = None
+) -> np.ndarray:
     """Points of the unit cube for a sampling method, (n, dimensions).
+
+    Args:
+        node: the block.
+        dimensions: of the cube.
+        seed: of the method.
+        span: first point, and one beyond the last; None: all of them.
 
     Raises:
         StudyError: the method returns something else.
     """
     method = METHODS[node.block.method]
     assert method.points is not None
-    points = np.asarray(method.points(SamplingRequest(node.block, dimensions, seed, node.path)))
+    first, stop = span or (0, node.block.count)
+    request = SamplingRequest(node.block, dimensions, seed, node.path, first, stop)
+    points = np.asarray(method.points(request))
     is_right = points.dtype.kind == "f" and points.shape == (len(points) or 1, dimensions)
     if not is_right or not np.all((points >= 0) & (points <= 1)):
         raise StudyError(
             f"{node.path}.method = {method.name!r}: gives {points.dtype} of shape {points.shape}; "
             f"wanted one or more points of {dimensions} numbers from 0 to 1"
+        )
+    if method.is_streamed and len(points) != stop - first:
+        raise StudyError(
+            f"{node.path}.method = {method.name!r}: gives {len(points)} points; wanted those from "
+            f"{first} to before {stop}"
         )
     return points

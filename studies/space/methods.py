@@ -8,6 +8,8 @@ only list of them; `METHODS.add` adds your own.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
+from threading import Lock
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -15,6 +17,11 @@ import numpy as np
 from jaxmodel.table import Table
 from studies.errors import field_error
 from studies.space.indices import elementary_effects, sobol_indices
+
+#: Most points of one Latin hypercube, all of which are made at once.
+LARGEST_CUBE = 10**7
+#: Points after which SciPy's Sobol sequence ends.
+LONGEST_SEQUENCE = 2**30
 
 
 class SamplingRequest(NamedTuple):
@@ -24,6 +31,10 @@ class SamplingRequest(NamedTuple):
     dimensions: int  # of the unit cube
     seed: int
     path: str  # of the block, for messages
+    # points wanted, from 0: first, and one beyond the last. Methods that are not streamed are asked
+    # for all of them
+    first: int
+    stop: int
 
 
 class Analysis(NamedTuple):
@@ -58,6 +69,7 @@ class Method(NamedTuple):
     # points of the unit cube (n, d); the first ones stay the same when more are requested. None:
     # the axes' own values, combined as follows
     points: Callable[[SamplingRequest], np.ndarray] | None = None
+    is_streamed: bool = False  # gives some of its `count` points without the others
     combine: Literal["product", "side by side"] = "product"
     # of the design's points (n, d), a metric there (n,), NaN where the case failed, and the names
     # of the factors; a design made for it cannot be combined with others
@@ -69,7 +81,10 @@ class Method(NamedTuple):
 
 def random_points(request: SamplingRequest) -> np.ndarray:
     """Independent and uniform."""
-    return np.random.default_rng(request.seed).random((request.block.count, request.dimensions))
+    generator = np.random.PCG64(request.seed)
+    generator.advance(request.first * request.dimensions)  # a draw for each number
+    shape = request.stop - request.first, request.dimensions
+    return np.random.Generator(generator).random(shape)
 
 
 def hypercube_points(request: SamplingRequest) -> np.ndarray:
@@ -77,27 +92,61 @@ def hypercube_points(request: SamplingRequest) -> np.ndarray:
     from scipy.stats import qmc
 
     size = request.block.size or request.block.count
+    if size > LARGEST_CUBE:
+        raise field_error(
+            f"{request.path}.size", size, f"up to {LARGEST_CUBE} points in a Latin hypercube", "1"
+        )
+    begins = request.first // size
     parts = [
         qmc.LatinHypercube(request.dimensions, rng=np.random.default_rng([request.seed, k])).random(
             size
         )
-        for k in range(request.block.count // size)
+        for k in range(begins, -(-request.stop // size))
     ]
-    return np.concatenate(parts)
+    return np.concatenate(parts)[request.first - begins * size : request.stop - begins * size]
 
 
 def sobol_points(request: SamplingRequest) -> np.ndarray:
-    """Scrambled Sobol points: the next power of two, a balanced sequence, truncated."""
-    from scipy.stats import qmc
-
+    """Scrambled Sobol points."""
     if request.dimensions > 21201:
         raise field_error(
             f"{request.path}.axes", request.dimensions, "up to 21201 dimensions for Sobol points"
         )
-    exponent = int(np.ceil(np.log2(max(request.block.count, 1))))
-    rng = np.random.default_rng(request.seed)
-    engine = qmc.Sobol(request.dimensions, scramble=True, rng=rng)
-    return engine.random_base2(exponent)[: request.block.count]
+    if request.stop > LONGEST_SEQUENCE:
+        raise field_error(
+            f"{request.path}.count", request.stop, f"up to {LONGEST_SEQUENCE} Sobol points", "1"
+        )
+    sequence = _sequence(request.dimensions, request.seed)
+    with sequence.lock:
+        return sequence.points(request.first, request.stop)
+
+
+class _Sequence:
+    """A Sobol sequence that goes on from where it stands: each step over a point takes time."""
+
+    def __init__(self, dimensions: int, seed: int) -> None:
+        from scipy.stats import qmc
+
+        rng = np.random.default_rng(seed)
+        self._engine = qmc.Sobol(dimensions, scramble=True, rng=rng)
+        self.lock = Lock()
+
+    def points(self, first: int, stop: int) -> np.ndarray:
+        """Points from `first` to before `stop`."""
+        if self._engine.num_generated > first:
+            self._engine.reset()
+        if first > self._engine.num_generated:
+            self._engine.fast_forward(first - self._engine.num_generated)
+        if first:
+            return np.asarray(self._engine.random(stop - first))
+        # SciPy warns of a beginning that is not balanced, which one of a power of two is
+        exponent = int(np.ceil(np.log2(max(stop, 1))))
+        return np.asarray(self._engine.random_base2(exponent)[:stop])
+
+
+@lru_cache(maxsize=4)
+def _sequence(dimensions: int, seed: int) -> _Sequence:
+    return _Sequence(dimensions, seed)
 
 
 def saltelli_points(points: np.ndarray) -> np.ndarray:
@@ -183,14 +232,15 @@ METHODS: Table[Method] = Table(
         Method("grid", "every combination of"),
         Method("zip", "side by side", combine="side by side"),
         Method("list", "{} cases, spelt out in the file", ("cases",)),
-        Method("random", "{} random points of", ("count",), random_points),
+        Method("random", "{} random points of", ("count",), random_points, True),
         Method(
             "latin_hypercube",
             "{} points of Latin hypercubes of",
             ("count", "size"),
             hypercube_points,
+            True,
         ),
-        Method("sobol", "{} Sobol points of", ("count",), sobol_points),
+        Method("sobol", "{} Sobol points of", ("count",), sobol_points, True),
         Method(
             "morris",
             "{} trajectories of a Morris design of",

@@ -39,7 +39,7 @@ class Block(Section):
     cases: tuple[dict[str, Any], ...] = described(
         (), "-", "for method list: field = value, per case"
     )
-    count: int = described(0, "1", "points of a sampling method", ge=0, le=10**7)
+    count: int = described(0, "1", "points of a sampling method", ge=0, le=10**12)
     size: int = described(0, "1", "points of one Latin hypercube; 0: count", ge=0, le=10**7)
     levels: int = described(4, "1", "levels of a Morris grid", ge=2, le=100)
 

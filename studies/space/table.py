@@ -17,7 +17,7 @@ import numpy as np
 from studies.errors import StudyError, field_error, nearest
 from studies.space.axes import ALIASES, LABELS, LIMIT, READY_MADE, SHOWN_AS
 from studies.space.condition import evaluate
-from studies.space.designs import length, spread
+from studies.space.designs import design_of
 from studies.space.spec import SweepSpec
 from studies.study.consistency import SAMPLE_LIMIT
 from studies.study.fields import Columns, Fields, padded
@@ -44,6 +44,7 @@ class CaseTable:
     seed: np.ndarray  # (n,)
     n_dropped: int  # cases excluded by `where`
     origin: np.ndarray  # for each row of the design, including duplicates, the number of its case
+    row: np.ndarray  # number of its row in the design, from 0, (n,)
 
     def __len__(self) -> int:
         return len(self.repeat)
@@ -70,6 +71,7 @@ class CaseTable:
             repeat=self.repeat[chosen],
             case_id=self.case_id[chosen],
             seed=self.seed[chosen],
+            row=self.row[chosen],
         )
 
 
@@ -117,13 +119,26 @@ def _codes(column: np.ndarray) -> np.ndarray:
     return np.unique(column, axis=axis, return_inverse=True)[1].ravel()
 
 
-def build_table(spec: SweepSpec) -> CaseTable:
+def build_table(spec: SweepSpec, rows: np.ndarray | None = None) -> CaseTable:
     """Expand a sweep into its cases.
+
+    Args:
+        spec: the sweep.
+        rows: numbers of those rows of its design that are wanted, ascending, (n,); None: all.
 
     Raises:
         StudyError: a bad axis or condition, no case left, columns that do not fit one program.
     """
-    columns = spread(spec.root, spec.study, spec.sweep.seed)
+    design = design_of(spec.root, spec.study, spec.sweep.seed)
+    is_whole = rows is None
+    if rows is None:
+        if design.size > LIMIT:
+            raise StudyError(
+                f"sweep: {design.size:.3g} cases; allowed: up to {LIMIT}. studies screen finds the "
+                "best of more"
+            )
+        rows = np.arange(design.size)
+    columns = design.rows(rows)
     environment_columns(spec.sweep.environments, columns)
     _check_shapes(columns)
     _check_samples(spec.study, columns)
@@ -131,14 +146,14 @@ def build_table(spec: SweepSpec) -> CaseTable:
     check_varied(spec.data, spec.study, columns)
     if np.any(columns.get(DELAY, np.zeros(1)).astype(str) == AUTO):
         raise field_error(DELAY, AUTO, "numbers in an axis; without the axis, 'auto' holds", "s")
-    n = length(columns)
+    n = len(rows)
     kept = np.arange(n)
     if spec.sweep.where:
         truth = evaluate(
             spec.sweep.where, lambda name: values(spec.study, columns, name), "sweep.where"
         )
         kept = np.flatnonzero(np.broadcast_to(truth, (n,)))
-    if len(kept) == 0:
+    if len(kept) == 0 and is_whole:
         raise StudyError(f"sweep.where = {spec.sweep.where!r}: true for none of {n} cases")
     repeats = spec.sweep.repeats
     if len(kept) * repeats > LIMIT:
@@ -153,7 +168,8 @@ def build_table(spec: SweepSpec) -> CaseTable:
     single = np.sort(first)
     origin = np.searchsorted(single, first[which])
     seeds = _seeds(spec.study, columns, ids)
-    table = CaseTable(spec.study, columns, repeat, ids, seeds, n - len(kept), origin)
+    dropped = n - len(kept)
+    table = CaseTable(spec.study, columns, repeat, ids, seeds, dropped, origin, rows[index])
     return table if len(single) == len(ids) else table.rows(single)
 
 
