@@ -21,6 +21,8 @@ from .fitting.run import run_fit
 from .fitting.spec import load_fit
 from .laws.run import run_laws
 from .papers.run import run_paper
+from .screen.run import run_screen
+from .screen.shards import screen_of
 from .show.document import schema
 from .single.plant import controller_of, plant_of, write_system
 from .single.run import replay, simulate
@@ -83,10 +85,12 @@ __all__ = [
     "run_fit",
     "run_laws",
     "run_paper",
+    "run_screen",
     "run_study",
     "run_sweep",
     "run_tuning",
     "schema",
+    "screen_of",
     "simulate",
     "spillover_design",
     "status_rows",

@@ -28,6 +28,7 @@ from studies.export.commands import add_commands as add_export
 from studies.fitting.commands import add_commands as add_fit
 from studies.laws.commands import add_commands as add_laws
 from studies.papers.commands import add_commands as add_paper
+from studies.screen.commands import add_commands as add_screen
 from studies.show import document
 from studies.show.document import AsJson, print_document
 from studies.single.commands import add_commands as add_single
@@ -166,6 +167,7 @@ for add_commands in (
     add_single,
     add_verify,
     add_sweeps,
+    add_screen,
     add_tuning,
     add_fit,
     add_export,

@@ -25,6 +25,9 @@ from studies.engine.folder import CHUNKS, SweepFolder, finished_cases, read_mani
 from studies.engine.results import read_sweep
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
+from studies.screen.run import run_screen
+from studies.screen.shards import screen_of
+from studies.screen.workers import ClusterScreener
 from studies.tuning.run import make_evaluator
 from studies.tuning.workers import ClusterEvaluator
 from tests.clusters import machines
@@ -79,6 +82,21 @@ def test_numbers_are_those_of_the_local_run(cluster, local, tmp_path):
     assert outcome.n_run == CASES and len(outcome.lost) == 0
     assert_same(arrays(local), arrays(tmp_path / "out"), 1e-12)
     assert "workers: 2" in text and "144/144 cases" in text
+
+
+def test_a_screen_has_the_same_tally(cluster, tmp_path):
+    sweep = {"method": "random", "count": 200, "axes": {"gain": {"from": 0.1, "to": 1.0}}}
+    screen = screen_of(small_spec(sweep), keep=9, shard_size=64)
+    tallies = []
+    for name, screener in (("here", None), ("there", ClusterScreener(cluster.client, 60.0))):
+        done = run_screen(screen, tmp_path / name, is_quiet=True, screener=screener)
+        assert not done.lost and done.is_done.all()
+        tallies.append(done.tally)
+    here, there = tallies
+    np.testing.assert_array_equal(here.row, there.row)
+    np.testing.assert_array_equal(here.endings, there.endings)
+    np.testing.assert_allclose(here.value, there.value, rtol=1e-12)
+    assert here.n_designs == 200 and here.sketch[0].sum() == here.endings[0]
 
 
 @pytest.mark.long  # in short: numbers on workers are those of the local run, sweep after sweep

@@ -155,8 +155,8 @@ def table_of(examples):
         for name in names
     }
     n = len(rows)
-    zero = np.zeros(n, int)
-    return CaseTable(default, columns, zero, zero.astype("S16"), zero, 0, np.arange(n), np.arange(n))
+    zero, row = np.zeros(n, int), np.arange(n)
+    return CaseTable(default, columns, zero, zero.astype("S16"), zero, 0, row, row)
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,9 @@ from __future__ import annotations
 import json
 import threading
 from collections import deque
-from collections.abc import Generator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Generator, Iterable
+from contextlib import closing
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from jaxmodel.case import Structure
 from studies import config
@@ -27,19 +28,70 @@ from studies.space.table import CaseTable
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-#: Chunks in flight per worker: one running, one waiting.
+T = TypeVar("T")
+
+#: Jobs in flight per worker: one running, one waiting.
 AHEAD = 2
 #: Minimum number of chunks per worker, so that none waits long for the last ones.
 LEAST_CHUNKS = 4
 
 
 class InFlight(NamedTuple):
-    """A chunk in flight."""
+    """A job in flight."""
+
+    job: Any
+    is_alone: bool = False  # nothing else is in flight
+
+
+def answers(
+    client: Client,
+    watch: Watch,
+    jobs: Iterable[T],
+    submit: Callable[[T], Future[Any]],
+    stop: threading.Event,
+) -> Generator[tuple[T, Any]]:
+    """Jobs with their answers, or with a text that says why they were given up.
+
+    Args:
+        client: of the cluster.
+        watch: over its workers.
+        jobs: what is to be done.
+        submit: sends a job to a worker.
+        stop: once set, no further jobs are sent.
+    """
+    waiting = iter(jobs)
+    suspects: deque[T] = deque()
+    in_flight: dict[Future[Any], InFlight] = {}
+    try:
+        while True:
+            while len(in_flight) < AHEAD * max(watch.n_workers, 1) and not stop.is_set():
+                job = next(waiting, None)
+                if job is None:
+                    break
+                in_flight[submit(job)] = InFlight(job)
+            if not in_flight and suspects and not stop.is_set():
+                job = suspects.popleft()
+                in_flight[submit(job)] = InFlight(job, is_alone=True)
+            if not in_flight or (stop.is_set() and not watch.n_workers):
+                return
+            for future in watch.finished(in_flight):
+                entry = in_flight.pop(future)
+                answer = watch.outcome(future)
+                if isinstance(answer, str) and not entry.is_alone:
+                    suspects.append(entry.job)
+                else:
+                    yield entry.job, answer
+    finally:
+        if in_flight:
+            client.cancel(list(in_flight))
+
+
+class ChunkOf(NamedTuple):
+    """A chunk to be run."""
 
     group: Group
     chunk: Chunk
     has_own_ratio: bool  # of the group
-    is_alone: bool = False  # nothing else is in flight
 
 
 class ClusterRunner:
@@ -75,59 +127,34 @@ class ClusterRunner:
         watch = Watch(self._client, self._timeout, reporter.say)
         reporter.say(f"workers: {watch.n_workers}; each compiles before its first chunk")
         owns = [has_own_ratio(table, group) for group in groups]  # structures can be equal
-        waiting = (
-            InFlight(group, chunk, own)
+        jobs = (
+            ChunkOf(group, chunk, own)
             for group, own in zip(groups, owns, strict=True)
             for chunk in group.chunks()
         )
-        suspects: deque[InFlight] = deque()
-        in_flight: dict[Future[Any], InFlight] = {}
         compiled: set[Structure] = set()
+        with closing(answers(self._client, watch, jobs, self._submit, stop)) as answered:
+            for job, answer in answered:
+                structure = job.group.structure
+                if not isinstance(answer, ChunkDone):
+                    yield Lost(job.chunk, answer)
+                    continue
+                if answer.compile_time and structure not in compiled:
+                    compiled.add(structure)
+                    reporter.compiled(answer.executor, answer.compile_time)
+                yield Done(job.chunk, structure.substeps, answer.judged)
 
-        def begin(entry: InFlight | None) -> bool:
-            if entry is None or stop.is_set():
-                return False
-            in_flight[self._submit(entry)] = entry
-            return True
-
-        try:
-            while True:
-                while len(in_flight) < AHEAD * max(watch.n_workers, 1) and begin(
-                    next(waiting, None)
-                ):
-                    pass
-                if not in_flight and suspects:
-                    begin(suspects.popleft())
-                if not in_flight or (stop.is_set() and not watch.n_workers):
-                    return
-                for future in watch.finished(in_flight):
-                    entry = in_flight.pop(future)
-                    structure = entry.group.structure
-                    answer = watch.outcome(future)
-                    if isinstance(answer, ChunkDone):
-                        if answer.compile_time and structure not in compiled:
-                            compiled.add(structure)
-                            reporter.compiled(answer.executor, answer.compile_time)
-                        yield Done(entry.chunk, structure.substeps, answer.judged)
-                    elif entry.is_alone:
-                        yield Lost(entry.chunk, answer)
-                    else:
-                        suspects.append(entry._replace(is_alone=True))
-        finally:
-            if in_flight:
-                self._client.cancel(list(in_flight))
-
-    def _submit(self, entry: InFlight) -> Future[Any]:
-        group = entry.group
+    def _submit(self, one: ChunkOf) -> Future[Any]:
+        group = one.group
         job = ChunkJob(
             identity=self._identity,
             precision=self._precision,
             spec=self._spec,
             structure=group.structure,
-            has_own_ratio=entry.has_own_ratio,
+            has_own_ratio=one.has_own_ratio,
             is_judged=group.is_judged,
             robustness=group.robustness,
             size=group.layout.size,
-            rows=entry.chunk.rows,
+            rows=one.chunk.rows,
         )
         return self._client.submit(run_chunk, job, pure=False)

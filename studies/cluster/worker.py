@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import json
 import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache, lru_cache
 from importlib.metadata import version
 from threading import RLock
@@ -58,7 +60,9 @@ def identity() -> dict[str, str]:
     """What must be the same on client and workers."""
     extend_from_environment()
     return {
-        "code": sources.digest("studies.cluster.worker", "studies.tuning.workers"),
+        "code": sources.digest(
+            "studies.cluster.worker", "studies.screen.workers", "studies.tuning.workers"
+        ),
         "python": ".".join(platform.python_version_tuple()[:2]),
         **{name: version(name) for name in ("jax", "jaxlib", "numpy")},
     }
@@ -87,6 +91,24 @@ def configure_worker(precision: str, worker: Worker) -> None:
     config.start(precision)
 
 
+@contextmanager
+def working(expected: dict[str, str], precision: str) -> Iterator[Worker]:
+    """This worker, for one job that has all of it.
+
+    Args:
+        expected: versions of the client, from `identity`.
+        precision: of the job.
+
+    Raises:
+        StudyError: the worker has other versions than the client.
+    """
+    with alone:
+        worker = get_worker()
+        refuse_difference(expected, worker)
+        configure_worker(precision, worker)
+        yield worker
+
+
 def chunk_size(n: int, structure: Structure, precision: str) -> int:
     """How many of n cases this worker prefers to run at once."""
     with alone:
@@ -100,10 +122,7 @@ def run_chunk(job: ChunkJob) -> ChunkDone:
     Raises:
         StudyError: the worker has other versions than the client.
     """
-    with alone:
-        worker = get_worker()
-        refuse_difference(job.identity, worker)
-        configure_worker(job.precision, worker)
+    with working(job.identity, job.precision) as worker:
         table = _table(job.spec)
         executor = _executor(job.precision, job.spec, job.structure, job.size, job.has_own_ratio)
         is_first = executor.compile_time == 0

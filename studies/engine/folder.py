@@ -64,6 +64,7 @@ SWEEPS = Content(
     re.compile(r"\.joined\.h5|\.(joined\.h5|baseline\.h5|sweep\.json)\.[0-9a-f]{8}\.tmp"),
 )
 TUNINGS = Content("a tuning", TUNING, re.compile(r"\..+\.[0-9a-f]{8}\.tmp"))
+SCREENS = Content("a screen", "screen.json", re.compile(r"\..+\.[0-9a-f]{8}\.tmp"))
 ATLASES = Content("an atlas", "runs", re.compile(r"\.unfinished-.*"))
 #: Of a folder with a request and folders of its own in it.
 _UNFINISHED = re.compile(r"\.unfinished-.*|\..+\.[0-9a-f]{8}\.tmp")

@@ -139,7 +139,7 @@ def run_sweep(
             return run_sweep(spec, out, is_resumed, runner=runner, phases=phases)
     say = partial(phases.console.print, soft_wrap=True)
     manifest = make_manifest(spec.data)
-    with open_folder(out, manifest, is_resumed) as folder, _interrupts() as stop:
+    with open_folder(out, manifest, is_resumed) as folder, interrupts() as stop:
         kept_metrics(spec)
         table = build_table(spec)
         check_screen_names(spec, table)
@@ -345,7 +345,7 @@ def _check_whole(table: CaseTable, rows: np.ndarray, done: np.ndarray, out: Path
 
 
 @contextmanager
-def _interrupts() -> Iterator[threading.Event]:
+def interrupts() -> Iterator[threading.Event]:
     """An event that Ctrl-C sets; a second Ctrl-C ends the process at once."""
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():

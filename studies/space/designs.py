@@ -21,7 +21,7 @@ from studies.study.paths import checked_value, known_field
 from studies.study.spec import Study
 
 
-class Design(NamedTuple):
+class LazyCases(NamedTuple):
     """Cases as they are written, made only when they are asked for."""
 
     names: tuple[str, ...]  # of the columns
@@ -29,7 +29,7 @@ class Design(NamedTuple):
     rows: Callable[[np.ndarray], Columns]  # of these numbers, from 0, ascending, (n,)
 
 
-def design_of(node: BlockNode, study: Study, seed: int, stride: int = 1000) -> Design:
+def design_of(node: BlockNode, study: Study, seed: int, stride: int = 1000) -> LazyCases:
     """The cases of a block; without axes one, without columns.
 
     Args:
@@ -58,8 +58,8 @@ def design_of(node: BlockNode, study: Study, seed: int, stride: int = 1000) -> D
     return _product(parts)
 
 
-def _stored(columns: Columns) -> Design:
-    return Design(
+def _stored(columns: Columns) -> LazyCases:
+    return LazyCases(
         tuple(columns),
         length(columns),
         lambda rows: {name: column[rows] for name, column in columns.items()},
@@ -74,7 +74,7 @@ def _axes(node: BlockNode, study: Study) -> dict[str, Axis]:
     }
 
 
-def _grid_of(axis: Axis, path: str) -> Design:
+def _grid_of(axis: Axis, path: str) -> LazyCases:
     if axis.grid is None:
         raise StudyError(
             f"{path}: a range needs count (placement: candidates) for methods grid and zip"
@@ -87,7 +87,7 @@ def length(columns: Columns) -> int:
     return len(next(iter(columns.values()))) if columns else 1
 
 
-def _check_names(parts: list[Design], path: str) -> None:
+def _check_names(parts: list[LazyCases], path: str) -> None:
     seen: set[str] = set()
     for part in parts:
         for name in part.names:
@@ -100,32 +100,33 @@ def _check_names(parts: list[Design], path: str) -> None:
             raise StudyError(f"{path}: {whole} varies as a whole and by its entry {name}")
 
 
-def _zipped(parts: list[Design], path: str) -> Design:
+def _zipped(parts: list[LazyCases], path: str) -> LazyCases:
     sizes = [part.size for part in parts]
     if len(set(sizes)) > 1:
         named = ", ".join(f"{'/'.join(part.names)}: {part.size}" for part in parts)
         raise StudyError(f"{path}: axes of one length side by side; here {named}")
-    return Design(
+    return LazyCases(
         _names(parts),
         sizes[0] if sizes else 1,
         lambda rows: {name: x for part in parts for name, x in part.rows(rows).items()},
     )
 
 
-def _product(parts: list[Design]) -> Design:
+def _product(parts: list[LazyCases]) -> LazyCases:
     """Every combination; the last part varies fastest."""
 
     def rows_of(rows: np.ndarray) -> Columns:
-        result, inner = {}, math.prod(part.size for part in parts)
+        result: dict[str, np.ndarray] = {}
+        inner = math.prod(part.size for part in parts)
         for part in parts:
             inner //= part.size
             result |= _some(part, rows // inner % part.size)
         return result
 
-    return Design(_names(parts), math.prod(part.size for part in parts), rows_of)
+    return LazyCases(_names(parts), math.prod(part.size for part in parts), rows_of)
 
 
-def _some(part: Design, rows: np.ndarray) -> Columns:
+def _some(part: LazyCases, rows: np.ndarray) -> Columns:
     """Rows of a part, in any order and as often as named."""
     distinct, where = np.unique(rows, return_inverse=True)
     if len(distinct) == len(rows) and np.all(rows[:-1] < rows[1:]):
@@ -133,7 +134,7 @@ def _some(part: Design, rows: np.ndarray) -> Columns:
     return {name: column[where] for name, column in part.rows(distinct).items()}
 
 
-def _names(parts: list[Design]) -> tuple[str, ...]:
+def _names(parts: list[LazyCases]) -> tuple[str, ...]:
     return tuple(name for part in parts for name in part.names)
 
 
@@ -159,7 +160,7 @@ def _list_cases(node: BlockNode, study: Study) -> Columns:
     return columns
 
 
-def _sampled(node: BlockNode, study: Study, seed: int) -> Design:
+def _sampled(node: BlockNode, study: Study, seed: int) -> LazyCases:
     axes, method = _axes(node, study), METHODS[node.block.method]
     dimensions = sum(axis.dimensions for axis in axes.values())
 
@@ -178,7 +179,7 @@ def _sampled(node: BlockNode, study: Study, seed: int) -> Design:
     names = tuple(at(np.full((1, dimensions), 0.5)))
     if not method.is_streamed:
         every = unit_points(node, dimensions, seed)
-        return Design(names, len(every), lambda rows: at(every[rows]))
+        return LazyCases(names, len(every), lambda rows: at(every[rows]))
 
     def rows_of(rows: np.ndarray) -> Columns:
         first, stop = int(rows[0]), int(rows[-1]) + 1
@@ -189,7 +190,7 @@ def _sampled(node: BlockNode, study: Study, seed: int) -> Design:
             )
         return at(unit_points(node, dimensions, seed, (first, stop))[rows - first])
 
-    return Design(names, node.block.count, rows_of)
+    return LazyCases(names, node.block.count, rows_of)
 
 
 def unit_points(
@@ -209,7 +210,14 @@ def unit_points(
     method = METHODS[node.block.method]
     assert method.points is not None
     first, stop = span or (0, node.block.count)
-    request = SamplingRequest(node.block, dimensions, seed, node.path, first, stop)
+    request = SamplingRequest(
+        block=node.block,
+        dimensions=dimensions,
+        seed=seed,
+        path=node.path,
+        first=first,
+        stop=stop,
+    )
     points = np.asarray(method.points(request))
     is_right = points.dtype.kind == "f" and points.shape == (len(points) or 1, dimensions)
     if not is_right or not np.all((points >= 0) & (points <= 1)):

@@ -258,7 +258,7 @@ def loose_study(table: CaseTable, index: int) -> Study:
     """The study of one case, whether or not its fields fit together."""
     study = table.study
     for name, column in table.fields.items():
-        data = set_value(study, name, _python(column[index]))
+        data = set_value(study, name, as_python(column[index]))
         study = Study.model_construct(**dict(_sections(data)))
     return study
 
@@ -270,11 +270,11 @@ def _sections(data: dict[str, Any]) -> Any:
         yield name, model.model_construct(**value) if isinstance(value, dict) else value
 
 
-def _python(value: Any) -> Any:
+def as_python(value: Any) -> Any:
     """A column's entry as Python numbers and tuples."""
     if isinstance(value, (np.ndarray, np.generic)):
         value = value.tolist()
-    return tuple(map(_python, value)) if isinstance(value, (list, tuple)) else value
+    return tuple(map(as_python, value)) if isinstance(value, (list, tuple)) else value
 
 
 def case_ids(study: Study, columns: Columns, repeat: np.ndarray) -> np.ndarray:

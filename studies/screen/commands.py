@@ -1,0 +1,103 @@
+"""The command `studies screen`."""
+
+from __future__ import annotations
+
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+from studies.cluster.connect import LocalWorkers, Scheduler, Workers, WorkerTimeout, on_workers
+from studies.config import start
+from studies.publish import REPORT, announce
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+    from studies.screen.run import Screener
+
+
+class Fidelity(StrEnum):
+    """Model of the runs."""
+
+    LINEAR = "linear"
+    FULL = "full"
+
+
+def add_commands(app: typer.Typer, console: Console) -> None:
+    """Add the command to the command line."""
+
+    @app.command()
+    def screen(
+        spec: Annotated[Path, typer.Argument(help="sweep file (TOML) or name of a ready-made one")],
+        out: Annotated[Path, typer.Option(help="folder for the results")],
+        by: Annotated[
+            str, typer.Option(help="metric; default: sweep.by. After - the largest come first")
+        ] = "",
+        keep: Annotated[int, typer.Option(help="number of designs to keep")] = 1000,
+        fidelity: Annotated[
+            Fidelity, typer.Option(help="model of the runs; full takes about twice as long")
+        ] = Fidelity.LINEAR,
+        resume: Annotated[
+            bool, typer.Option("--resume", help="go on with the screen in this folder, if any")
+        ] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", help="hide progress")] = False,
+        precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
+        scheduler: Scheduler = None,
+        local_workers: LocalWorkers = None,
+        worker_timeout: WorkerTimeout = 600.0,
+    ) -> None:
+        """Find the best of up to a billion designs: keeps these, not all cases as a sweep does.
+
+        Writes best.toml, a sweep of the kept designs; run it to judge them by the full model.
+        """
+        from studies.engine.folder import SCREENS, refuse_existing
+
+        workers = Workers(scheduler, local_workers, worker_timeout)
+        refuse_existing(out, SCREENS, resume)
+        start(precision, gpu=not workers.are_named)
+        from studies.engine.progress import Phases
+        from studies.screen.report import summary_lines, write_screen_report
+        from studies.screen.run import PHASES, run_screen
+        from studies.screen.shards import screen_of
+        from studies.screen.stored import BEST
+        from studies.space.spec import load_sweep
+
+        asked = screen_of(load_sweep(spec), by, keep, fidelity.value)
+
+        def make(client: Client) -> Screener:
+            from studies.screen.workers import ClusterScreener
+
+            return ClusterScreener(client, worker_timeout)
+
+        with Phases(console, PHASES, quiet) as phases:
+            with on_workers(workers, phases.say, make) as screener:
+                done = run_screen(asked, out, screener=screener, phases=phases)
+            if not done.is_interrupted:
+                phases.begin("report")
+                write_screen_report(out, done)
+        again = f"studies screen {spec} --out {out} --resume{workers.options}"
+        if done.is_interrupted:
+            print(
+                f"studies: interrupted; {done.tally.n_designs} of {asked.n_designs} designs are "
+                f"safe; continue with the same options and --resume: {again}",
+                file=sys.stderr,
+            )
+            sys.exit(130)
+        if not quiet:
+            for line in summary_lines(done):
+                console.print(line, soft_wrap=True)
+            console.print(
+                f"the full model of the best: studies sweep {out / BEST} --out DIR", soft_wrap=True
+            )
+            announce(console, out / REPORT)
+        if done.lost:
+            print(
+                f"studies: {len(done.lost)} of {asked.n_shards} shards were left out, see above; "
+                f"retry them: {again}",
+                file=sys.stderr,
+            )
+            sys.exit(1)

@@ -1,0 +1,64 @@
+"""Figures of a screen: how the metric is distributed, and what each axis does to it."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jaxmodel.metrics import METRICS
+from studies.screen.run import ScreenOutcome
+from studies.screen.tally import BUCKETS, GROWTH, LEAST, quantile
+from studies.show import figures
+from studies.show.units import headed, readable
+from studies.study.paths import field_unit
+
+#: Panels side by side.
+ACROSS = 3
+#: Shares of the designs in an interval, counted from the best: the curves.
+CURVES = ((0.5, "median"), (0.1, "best 10 %"), (0.001, "best 0.1 %"))
+
+
+def values(done: ScreenOutcome) -> Figure:
+    """Number of designs by value."""
+    counts = done.tally.sketch[0]
+    unit = METRICS[done.screen.metric].unit
+    factor = readable(unit)[0]
+    seen = np.flatnonzero(counts)
+    middle = factor * LEAST * GROWTH ** (np.arange(BUCKETS) + 0.5)
+    figure, axes = figures.one_panel(2.6)
+    part = slice(seen[0], seen[-1] + 1)
+    axes.fill_between(middle[part], counts[part], step="mid", color=figures.SERIES[0], alpha=0.6)
+    axes.axvline(factor * done.tally.value[-1], color=figures.SERIES[1], lw=1.2)
+    axes.set(xlabel=headed(done.screen.entry, unit), ylabel="designs")
+    figures.log_scale(axes, "x")
+    if counts[part].max() > 100:
+        axes.set_yscale("log")
+    return figure
+
+
+def influence(done: ScreenOutcome) -> Figure:
+    """Quantiles of the metric over every axis."""
+    screen = done.screen
+    unit = METRICS[screen.metric].unit
+    factor = readable(unit)[0]
+    is_largest = screen.ranking[1]
+    count = max(len(screen.axes.names), 1)
+    figure, axes = figures.new_figure(-(-count // ACROSS), min(count, ACROSS), 1.9, False)
+    panels = list(axes.flat)
+    for ax in panels[len(screen.axes.names) :]:
+        ax.set_visible(False)
+    for k, (ax, name) in enumerate(zip(panels, screen.axes.names, strict=False)):
+        part = done.tally.sketch[screen.axes.part(k)]
+        low, high = screen.axes.ends[k]
+        edges = np.concatenate([[low], screen.axes.bounds[k], [high]])
+        middle = (edges[1:] + edges[:-1]) / 2
+        for (share, text), color in zip(CURVES, figures.SERIES, strict=False):
+            at = 1 - share if is_largest else share
+            curve = [factor * quantile(counts, at) for counts in part]
+            ax.plot(middle, curve, color=color, lw=1.2, label=text)
+        own = field_unit(name.partition("[")[0])
+        ax.set_xlabel(name if own == "1" else f"{name} [{own}]")
+        figures.log_scale(ax, "y")
+    panels[0].set_ylabel(headed(screen.entry, unit))
+    figures.legend_above(figure, panels[0])
+    return figure

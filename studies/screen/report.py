@@ -1,0 +1,127 @@
+"""The page of a screen, and its summary: the best designs, and what the others were like."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxmodel import status
+from jaxmodel.metrics import METRICS
+from studies.publish import REPORT, publish
+from studies.screen.plots import influence, values
+from studies.screen.run import ScreenOutcome
+from studies.screen.stored import BEST
+from studies.screen.tally import LEFT_OUT, quantile
+from studies.show.figures import styled
+from studies.show.pages import page
+from studies.show.units import headed, readable
+from studies.space.table import build_table
+from studies.study.template import toml_text
+from studies.sweeps.plots import save_plot
+
+VALUES, INFLUENCE = "values.png", "influence.png"
+#: Shares of the designs whose quantiles are shown.
+SHARES = (0.0001, 0.01, 0.1, 0.5, 0.9)
+#: Designs in the table.
+SHOWN = 20
+
+
+def unit_of(done: ScreenOutcome) -> str:
+    """Unit of what the designs are ranked by."""
+    return METRICS[done.screen.metric].unit
+
+
+def quantity(done: ScreenOutcome, value: float) -> str:
+    """A value of the metric with its unit, as people read it."""
+    factor, unit = readable(unit_of(done))
+    return f"{factor * value:.4g}" + ("" if unit in ("", "1") else f" {unit}")
+
+
+def ending_rows(done: ScreenOutcome) -> list[tuple[str, str, str]]:
+    """How the designs ended: number, share and reason, most frequent first."""
+    endings, rows = done.tally.endings, []
+    for code in np.argsort(-endings, kind="stable"):
+        if endings[code]:
+            reason = "left out by where, or twice" if code == LEFT_OUT else status.REASONS[code]
+            share = f"{100 * endings[code] / done.tally.n_designs:.3g} %"
+            rows.append((f"{endings[code]}", share, reason))
+    return rows
+
+
+def quantile_rows(done: ScreenOutcome) -> list[tuple[str, str]]:
+    """Quantiles of the metric over all designs that ended well, exact within 1 %."""
+    sketch = done.tally.sketch[0]
+    return [
+        (f"{100 * share:g} %", f"{quantity(done, quantile(sketch, share))} or less")
+        for share in SHARES
+    ]
+
+
+def summary_lines(done: ScreenOutcome) -> list[str]:
+    """What the screen found, in a few lines."""
+    tally, screen = done.tally, done.screen
+    lines = [
+        f"{tally.n_designs} designs: "
+        + "; ".join(f"{number} {reason}" for number, _, reason in ending_rows(done))
+    ]
+    if not len(tally.row):
+        return [*lines, "no design ended well; nothing is kept"]
+    best, last = (quantity(done, tally.value[k]) for k in (0, -1))
+    half = quantity(done, quantile(tally.sketch[0], 0.5))
+    lines.append(
+        f"the best {len(tally.row)} by {screen.entry}: {best} to {last}; median of all: {half}"
+    )
+    return lines
+
+
+def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
+    """Write `report.html` and its figures into a screen's folder.
+
+    Raises:
+        StudyError: a file cannot be written.
+    """
+    screen, tally = done.screen, done.tally
+    drawings = {VALUES: values, INFLUENCE: influence}
+    with publish(folder, stale=drawings) as staging:
+        if len(tally.row):
+            with styled():
+                for name, draw in drawings.items():
+                    save_plot(draw(done), staging / name)
+        text = page(
+            "screen/report.html",
+            staging,
+            {"Sweep file": toml_text(screen.spec.data)},
+            about=screen.spec.study,
+            title=screen.spec.study.title,
+            folder=str(folder),
+            best=BEST,
+            screen=screen,
+            summary=summary_lines(done),
+            drawn=list(drawings) if len(tally.row) else [],
+            endings=ending_rows(done),
+            quantiles=quantile_rows(done),
+            heads=("number", headed(screen.entry, unit_of(done)), *screen.axes.names),
+            rows=_best_rows(done),
+            lost=done.lost,
+        )
+        (staging / REPORT).write_text(text, encoding="utf-8")
+
+
+def _best_rows(done: ScreenOutcome) -> list[tuple[str, ...]]:
+    from studies.screen.shards import axis_numbers
+
+    rows = done.tally.row[:SHOWN]
+    table = build_table(done.screen.spec, np.sort(rows))
+    place = {int(row): k for k, row in enumerate(table.row)}
+    numbers = axis_numbers(table)
+    factor = readable(unit_of(done))[0]
+    return [
+        (
+            str(row),
+            f"{factor * value:.4g}",
+            *(f"{numbers[name][place[row]]:.4g}" for name in done.screen.axes.names),
+        )
+        for row, value in zip(rows.tolist(), done.tally.value.tolist(), strict=False)
+        if row in place
+    ]

@@ -1,0 +1,193 @@
+"""A shard of a screen: consecutive designs that are made, run and reduced together."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from rich.console import Console
+
+from studies.engine.chunks import Done, LocalRunner
+from studies.engine.columns import labelled
+from studies.engine.plan import local_layout, plan_groups
+from studies.engine.progress import Phases, Reporter
+from studies.engine.results import SweepData, direction, metric_values
+from studies.engine.stored import chunk_arrays
+from studies.errors import StudyError, field_error
+from studies.screen.tally import Axes, Tally, divided, merged, nothing, only_left_out, tally_of
+from studies.space.axes import LIMIT
+from studies.space.designs import design_of
+from studies.space.methods import METHODS
+from studies.space.spec import SweepSpec
+from studies.space.table import CaseTable, as_numbers, build_table
+from studies.study.entries import entry_sizes, parse_entries
+from studies.study.fields import Columns
+
+#: Designs of a shard.
+SHARD = 2**18
+#: Designs by whose values axes are divided.
+FIRST = 2**12
+
+
+class ScreenRequest(NamedTuple):
+    """What is screened, and what is kept."""
+
+    spec: SweepSpec
+    by: str  # metric, or entry of one; a minus in front: the worst first
+    keep: int  # most designs kept
+    n_designs: int  # of the sweep
+    axes: Axes
+    shard_size: int  # designs; the last shard may have fewer
+
+    @property
+    def entry(self) -> str:
+        """What designs are ranked by, without the direction."""
+        return self.by.removeprefix("-")
+
+    @property
+    def metric(self) -> str:
+        """The metric of that entry."""
+        return self.entry.partition("[")[0]
+
+    @property
+    def ranking(self) -> tuple[int, bool]:
+        """How many designs are kept, and whether large values are the best."""
+        return self.keep, direction(self.by) == "largest"
+
+    @property
+    def n_shards(self) -> int:
+        """All of them."""
+        return -(-self.n_designs // self.shard_size)
+
+    def rows(self, shard: int) -> np.ndarray:
+        """Numbers of a shard's designs, (n,)."""
+        first = shard * self.shard_size
+        return np.arange(first, min(first + self.shard_size, self.n_designs))
+
+
+def screen_of(
+    spec: SweepSpec,
+    by: str = "",
+    keep: int = 1000,
+    fidelity: str = "linear",
+    shard_size: int = SHARD,
+) -> ScreenRequest:
+    """A screen of a sweep's designs.
+
+    Args:
+        spec: the sweep.
+        by: metric, or entry of one; "": what the sweep ranks by.
+        keep: most designs kept.
+        fidelity: model of the runs, "linear" or "full".
+        shard_size: designs of a shard.
+
+    Raises:
+        StudyError: a sweep that cannot be screened, or a bad metric.
+    """
+    spec = spec._replace(sweep=spec.sweep.model_copy(update={"fidelity": fidelity}))
+    by = by or spec.sweep.by
+    if METHODS[spec.sweep.method].analysis is not None:
+        raise field_error(
+            "sweep.method", spec.sweep.method, "any that is not for studies sensitivity"
+        )
+    for name in ("repeats", "environments", "screen"):
+        value = getattr(spec.sweep, name)
+        default = type(spec.sweep).model_fields[name].default
+        if value != default:
+            raise field_error(f"sweep.{name}", value, f"{default!r} in a screen")
+    if not 1 <= keep <= LIMIT:
+        raise field_error("--keep", keep, f"1 to {LIMIT} designs")
+    n_designs = design_of(spec.root, spec.study, spec.sweep.seed).size
+    table = build_table(spec, np.arange(min(n_designs, FIRST)))
+    if not len(table):
+        raise StudyError(f"sweep.where = {spec.sweep.where!r}: true for none of the first {FIRST}")
+    sizes = entry_sizes(spec.study) | {
+        "mode": int(table.values("link.modes").max()),
+        "controlled_mode": int(table.values("control.modes").max()),
+    }
+    parse_entries(by.removeprefix("-"), "--by", sizes)
+    return ScreenRequest(
+        spec=spec,
+        by=by,
+        keep=keep,
+        n_designs=n_designs,
+        axes=divided(_distinct(axis_numbers(table))),
+        shard_size=shard_size,
+    )
+
+
+def _distinct(columns: Columns) -> Columns:
+    """Columns that vary, without those that repeat another one, such as links that are alike."""
+    found: dict[str, np.ndarray] = {}
+    for name, column in columns.items():
+        is_known = any(np.array_equal(column, other) for other in found.values())
+        if not is_known and column.min() < column.max():
+            found[name] = column
+    return found
+
+
+def axis_numbers(table: CaseTable) -> Columns:
+    """Numbers of all columns, by the names of fields and entries, (n,) each."""
+    found: dict[str, np.ndarray] = {}
+    for name, column in table.fields.items():
+        if column.dtype.kind not in "bif":
+            continue
+        numbers = np.asarray(as_numbers(column, table.study.n_links), float)
+        for place in np.ndindex(numbers.shape[1:]):
+            entry = name + "".join(f"[{k}]" for k in place)
+            found[entry] = numbers[(slice(None), *place)]
+    return found
+
+
+def shard_tally(
+    screen: ScreenRequest,
+    shard: int,
+    table: CaseTable,
+    stop: threading.Event,
+    on_chunk: Callable[[np.ndarray], object] = lambda code: None,
+) -> Tally | None:
+    """Run the designs of a shard in this process and reduce them.
+
+    Args:
+        screen: of the shard.
+        shard: its number.
+        table: of its designs.
+        stop: once set, no further chunks are started.
+        on_chunk: called with the status codes of each chunk.
+
+    Returns:
+        The tally; None if it was stopped.
+    """
+    count = len(table)
+    dropped = only_left_out(len(screen.rows(shard)) - count)
+    total = nothing(screen.axes)._replace(endings=dropped)
+    if not count:
+        return total
+    is_linear = screen.spec.sweep.fidelity == "linear"
+    groups = plan_groups(
+        table, np.arange(count), local_layout, (screen.metric,), is_linear, is_judged=False
+    )
+    n_run = 0
+    with Phases(Console(quiet=True), ("compile", "run"), is_quiet=True) as phases:
+        reporter = Reporter(phases, "run", count, 0, len(groups))
+        for done in LocalRunner().run(table, groups, reporter, stop):
+            assert isinstance(done, Done)  # only workers of a cluster give chunks up
+            arrays = chunk_arrays(table, done, [screen.metric])
+            total = merged(total, _chunk_tally(screen, table, done, arrays), *screen.ranking)
+            n_run += len(done.chunk.rows)
+            on_chunk(arrays["status"])
+    return total if n_run == count else None
+
+
+def _chunk_tally(
+    screen: ScreenRequest, table: CaseTable, done: Done, arrays: dict[str, np.ndarray]
+) -> Tally:
+    part = table.rows(done.chunk.rows)
+    variables = {name: labelled(name, data) for name, data in arrays.items() if name != "case_id"}
+    value = metric_values(SweepData(variables, {}, screen.spec, part), screen.entry)
+    columns = axis_numbers(part)
+    return tally_of(
+        part.row, arrays["status"], np.asarray(value, float), columns, screen.axes, *screen.ranking
+    )

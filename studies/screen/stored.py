@@ -1,0 +1,143 @@
+"""The folder of a screen: what is screened, the tally so far, and the best designs as a sweep."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from studies.engine.folder import keep_request, make_manifest
+from studies.errors import StudyError
+from studies.publish import replacing
+from studies.screen.shards import ScreenRequest
+from studies.screen.tally import BUCKETS, GROWTH, LEAST, N_ENDINGS, Tally, nothing
+from studies.space.axes import LABELS
+from studies.space.table import as_python, build_table
+from studies.store import Variable, read_store, write_store
+from studies.study.template import toml_text, toml_value
+
+REQUEST, TALLY, BEST = "screen.json", "screen.h5", "best.toml"
+#: What must be the same in a folder that is gone on with.
+_CHECKED = ("spec", "by", "keep", "fidelity", "shard_size", "code", "precision", "jaxlib")
+#: Fields of a sweep that say which designs there are; `best.toml` names its cases instead.
+_SPREADING = {"method", "axes", "blocks", "cases", "count", "size", "levels", "where", "seed"}
+
+
+def begin(folder: Path, screen: ScreenRequest) -> tuple[np.ndarray, Tally]:
+    """Begin a screen in a folder, or go on with it.
+
+    Args:
+        folder: of the screen, locked.
+        screen: what is asked for.
+
+    Returns:
+        which shards are done, (n,); their tally.
+
+    Raises:
+        StudyError: the folder was begun with another screen, or its file is damaged.
+    """
+    request = {
+        **make_manifest(screen.spec.data, ("studies.screen.shards",)),
+        "by": screen.by,
+        "keep": screen.keep,
+        "fidelity": screen.spec.sweep.fidelity,
+        "shard_size": screen.shard_size,
+    }
+    keep_request(folder / REQUEST, request, _CHECKED, "sweep, metric, number, code or precision")
+    if not (folder / TALLY).is_file():
+        return np.zeros(screen.n_shards, bool), nothing(screen.axes)
+    return read_tally(folder, screen)
+
+
+def read_tally(folder: Path, screen: ScreenRequest) -> tuple[np.ndarray, Tally]:
+    """Which shards of a screen are done, and their tally; errors as `begin`."""
+    path, empty = folder / TALLY, nothing(screen.axes)
+    variables, _ = read_store(path)
+    try:
+        is_done = variables["is_done"].data > 0
+        tally = Tally(**{name: variables[name].data for name in Tally._fields})
+    except (KeyError, TypeError) as error:
+        raise _damaged(path, str(error)) from None
+    if is_done.shape != (screen.n_shards,):
+        raise _damaged(path, "number of shards")
+    for name, array in tally._asdict().items():
+        expected = getattr(empty, name)
+        kinds = "f" if name == "value" else "iu"
+        if array.dtype.kind not in kinds or array.shape[1:] != expected.shape[1:]:
+            raise _damaged(path, name)
+    n_done = sum(len(screen.rows(int(k))) for k in np.flatnonzero(is_done))
+    if (
+        tally.endings.shape != empty.endings.shape
+        or tally.sketch.shape != empty.sketch.shape
+        or np.any(tally.endings < 0)
+        or np.any(tally.sketch < 0)
+        or tally.n_designs != n_done
+    ):
+        raise _damaged(path, "numbers of designs")
+    is_row = (tally.row >= 0) & (tally.row < screen.n_designs)
+    if tally.row.shape != tally.value.shape or len(tally.row) > screen.keep or not is_row.all():
+        raise _damaged(path, "designs kept")
+    return is_done, tally
+
+
+def _damaged(path: Path, what: str) -> StudyError:
+    return StudyError(f"{path}: damaged ({what}); remove it and begin again with --resume")
+
+
+def write_tally(folder: Path, screen: ScreenRequest, is_done: np.ndarray, tally: Tally) -> None:
+    """Replace the tally in a folder, whole or not at all.
+
+    Raises:
+        StudyError: that fails.
+    """
+    lower = LEAST * GROWTH ** np.arange(BUCKETS)
+    names = ["all", *_interval_names(screen)]
+    variables = {
+        "is_done": Variable(is_done, ("shard",), "1", "whether a shard is in the tally"),
+        "endings": Variable(tally.endings, ("ending",), "1", "designs by status code"),
+        "row": Variable(tally.row, ("place",), "1", "number of a kept design, best first"),
+        "value": Variable(tally.value, ("place",), "SI", f"{screen.entry} there"),
+        "sketch": Variable(tally.sketch, ("part", "bucket"), "1", "designs by value"),
+        "part": Variable(np.array(names), ("part",), "1", "which designs: interval of an axis"),
+        "bucket": Variable(lower, ("bucket",), "SI", "least value in it; smaller ones: the first"),
+        "ending": Variable(
+            np.arange(N_ENDINGS), ("ending",), "1", "status code; the last one: left out by where"
+        ),
+    }
+    attributes = {"title": screen.spec.study.title, "by": screen.by, "n_designs": screen.n_designs}
+    write_store(folder / TALLY, variables, attributes)
+
+
+def _interval_names(screen: ScreenRequest) -> list[str]:
+    return [
+        f"{name}, interval {k + 1}"
+        for name, bounds in zip(screen.axes.names, screen.axes.bounds, strict=True)
+        for k in range(len(bounds) + 1)
+    ]
+
+
+def best_sweep(screen: ScreenRequest, tally: Tally) -> str:
+    """The kept designs as the file of a sweep, best first, whose cases have the same ids."""
+    data = screen.spec.data
+    written = {name: x for name, x in data["sweep"].items() if name not in _SPREADING}
+    sweep: dict[str, Any] = written | {"method": "list", "by": screen.by}
+    sweep.pop("fidelity", None)
+    sections = {name: x for name, x in data.items() if name != "sweep"}
+    rows = np.sort(tally.row)
+    table = build_table(screen.spec, rows)
+    place = {int(row): k for k, row in enumerate(table.row)}
+    fields = {name: x for name, x in table.fields.items() if name not in LABELS}
+    cases = [
+        {name: as_python(column[place[row]]) for name, column in fields.items()}
+        for row in tally.row.tolist()
+        if row in place  # others have the parameters of an earlier one
+    ]
+    lines = "".join(f"  {toml_value(case)},\n" for case in cases)
+    return f"{toml_text({**sections, 'sweep': sweep})}cases = [\n{lines}]\n"
+
+
+def write_best(folder: Path, screen: ScreenRequest, tally: Tally) -> None:
+    """Write `best.toml`, whole or not at all."""
+    with replacing(folder / BEST) as temporary:
+        temporary.write_text(best_sweep(screen, tally), encoding="utf-8")

@@ -1,0 +1,316 @@
+"""`studies screen`: tallies, designs made shard by shard, and going on after interruptions."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from jaxmodel import status
+from studies.cli import main
+from studies.engine.results import metric_values, read_sweep
+from studies.engine.sweep import run_sweep
+from studies.errors import StudyError
+from studies.screen.report import summary_lines, write_screen_report
+from studies.screen.run import LocalScreener, run_screen
+from studies.screen.shards import screen_of
+from studies.screen.stored import BEST, TALLY, read_tally, write_tally
+from studies.screen.tally import (
+    LEFT_OUT,
+    Tally,
+    divided,
+    merged,
+    nothing,
+    quantile,
+    tally_of,
+)
+from studies.space.spec import load_sweep, parse_sweep
+from studies.space.table import build_table
+from studies.store import Variable, read_store, write_store
+from tests.pages import text_of
+from tests.sweeps import small, small_spec
+
+#: Placements and gains; some leave the links or saturate.
+AXES = {"placement": {"kind": "same"}, "gain": {"from": 0.1, "to": 3.0, "scale": "log"}}
+SWEEP = {
+    "method": "random",
+    "count": 200,
+    "axes": AXES,
+    "where": "gain < 2.5",
+    "by": "structural_rms[link=2][station=2]",
+}
+SPEC = small_spec(SWEEP)
+KEEP = 12
+
+
+def screened(out, spec=SPEC, screener=None, shard_size=64, keep=KEEP, **more):
+    screen = screen_of(spec, keep=keep, shard_size=shard_size, **more)
+    return run_screen(screen, out, is_quiet=True, screener=screener)
+
+
+def assert_same(first: Tally, second: Tally):
+    for name, array in first._asdict().items():
+        other = getattr(second, name)
+        if name == "value":
+            np.testing.assert_allclose(array, other, rtol=1e-12)
+        else:
+            np.testing.assert_array_equal(array, other)
+
+
+# --- tallies --------------------------------------------------------------------------------------
+
+
+def random_designs(count, seed=0):
+    rng = np.random.default_rng(seed)
+    columns = {"x": rng.random(count), "kind": rng.integers(0, 3, count).astype(float)}
+    code = np.where(rng.random(count) < 0.1, status.SATURATED, status.OK)
+    value = 10 ** rng.normal(-6, 1, count) * (1 + columns["x"])
+    value[rng.random(count) < 0.05] = np.nan
+    return np.arange(count), code, value, columns
+
+
+@pytest.mark.parametrize("is_largest", [False, True])
+def test_tallies_merge_in_any_order(is_largest):
+    row, code, value, columns = random_designs(3000)
+    value[500:520] = value[500]  # ties
+    axes = divided(columns)
+
+    def part(chosen):
+        some = {name: x[chosen] for name, x in columns.items()}
+        return tally_of(row[chosen], code[chosen], value[chosen], some, axes, 50, is_largest)
+
+    whole = part(row)
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        total = nothing(axes)
+        for chosen in np.array_split(rng.permutation(row), rng.integers(2, 40)):
+            total = merged(part(chosen), total, 50, is_largest)
+        for first, second in zip(total, whole, strict=True):
+            np.testing.assert_array_equal(first, second)
+    fine = row[(code == status.OK) & np.isfinite(value)]
+    order = fine[np.argsort(-value[fine] if is_largest else value[fine], kind="stable")]
+    np.testing.assert_array_equal(whole.row, order[:50])
+    assert whole.n_designs == 3000 and whole.sketch[0].sum() == len(fine)
+
+
+def test_quantiles_are_exact_within_one_per_cent():
+    row, code, value, columns = random_designs(20_000)
+    code[:] = status.OK
+    value = np.abs(np.nan_to_num(value, nan=1e-6))
+    axes = divided(columns)
+    tally = tally_of(row, code, value, columns, axes, 10, False)
+    for share in (0.001, 0.1, 0.5, 0.9, 0.999):
+        exact = np.quantile(value, share, method="inverted_cdf")
+        assert abs(quantile(tally.sketch[0], share) / exact - 1) <= 0.0101
+    for k, kind in enumerate((0.0, 1.0, 2.0)):  # intervals of an axis are designs of their own
+        chosen = value[columns["kind"] == kind]
+        exact = np.quantile(chosen, 0.5, method="inverted_cdf")
+        counts = tally.sketch[axes.part(axes.names.index("kind"))][k]
+        assert counts.sum() == len(chosen)
+        assert abs(quantile(counts, 0.5) / exact - 1) <= 0.0101
+    assert np.isnan(quantile(np.zeros(10, int), 0.5))
+
+
+# --- designs --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["random", "sobol", "latin_hypercube"])
+def test_designs_made_in_parts_are_those_of_the_whole(method):
+    sweep = {"method": method, "count": 1000, "axes": AXES}
+    if method == "latin_hypercube":
+        sweep["size"] = 250
+    inner = {"method": "random", "count": 7, "axes": {"emc_exponent": {"from": 0.0, "to": 1.0}}}
+    spec = small_spec(sweep | {"blocks": [inner]})
+    table = build_table(spec)
+    assert len(table) == 7000
+    for first, stop in ((4000, 4700), (0, 300), (6990, 7000), (301, 302)):  # back and forth
+        part = build_table(spec, np.arange(first, stop))
+        np.testing.assert_array_equal(part.case_id, table.case_id[first:stop])
+        np.testing.assert_array_equal(part.seed, table.seed[first:stop])
+        np.testing.assert_array_equal(part.row, np.arange(first, stop))
+
+
+def test_a_billion_designs_are_made_anywhere():
+    sweep = {"method": "random", "count": 10**12, "axes": AXES}
+    rows = np.arange(10**12 - 100, 10**12)
+    table = build_table(small_spec(sweep), rows)
+    assert len(table) == 100
+    with pytest.raises(StudyError, match=r"1e\+12 cases; allowed: up to 10000000. studies screen"):
+        build_table(small_spec(sweep))
+    with pytest.raises(StudyError, match="up to 1073741824 Sobol points"):
+        build_table(small_spec(sweep | {"method": "sobol"}), rows)
+
+
+# --- screens --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A screen without interruption."""
+    out = tmp_path_factory.mktemp("screen") / "whole"
+    return out, screened(out)
+
+
+def test_a_screen_has_the_values_of_a_sweep_by_the_linear_model(tmp_path):
+    done = screened(tmp_path / "screen", keep=200)
+    run_sweep(small_spec(SWEEP | {"fidelity": "linear"}), tmp_path / "sweep", is_quiet=True)
+    data = read_sweep(tmp_path / "sweep")
+    value = dict(zip(data.table.row.tolist(), metric_values(data, SWEEP["by"]), strict=True))
+    # the sweep judges stability as well, which a screen does not: unstable ones are kept here
+    stable = set(data.table.row[data["status"] == status.OK].tolist())
+    kept = done.tally.row.tolist()
+    assert stable <= set(kept) and len(stable) > 100
+    np.testing.assert_allclose(done.tally.value, [value[row] for row in kept], rtol=1e-9)
+    assert np.all(np.diff(done.tally.value) >= 0)
+    endings = done.tally.endings
+    assert endings[LEFT_OUT] == data.table.n_dropped > 0
+    assert endings[status.OK] == len(kept) and done.tally.n_designs == 200
+    saturated = set(data.table.row[data["status"] == status.SATURATED].tolist())
+    assert saturated and not saturated & set(kept)
+    assert endings[status.SATURATED] == 200 - len(kept) - endings[LEFT_OUT]
+
+
+def test_kept_designs_are_a_sweep_with_the_same_ids(whole):
+    out, done = whole
+    spec = load_sweep(out / BEST)
+    expected = build_table(SPEC, np.sort(done.tally.row))
+    place = {int(row): k for k, row in enumerate(expected.row)}
+    order = [place[row] for row in done.tally.row.tolist()]
+    table = build_table(spec)
+    np.testing.assert_array_equal(table.case_id, expected.case_id[order])
+    np.testing.assert_array_equal(table.seed, expected.seed[order])
+    assert spec.sweep.fidelity == "full"
+
+
+class Stopped(LocalScreener):
+    """Ends after some shards, as if it had been killed."""
+
+    def __init__(self, count):
+        self._count = count
+
+    def tallies(self, screen, shards, progress, stop):
+        for k, answer in enumerate(super().tallies(screen, shards, progress, stop)):
+            if k == self._count:
+                raise StudyError("killed")
+            yield answer
+
+
+def test_an_interrupted_screen_goes_on(whole, tmp_path):
+    _, done = whole
+    out = tmp_path / "out"
+    for count in (1, 2):
+        with pytest.raises(StudyError, match="killed"):
+            screened(out, screener=Stopped(count))
+    is_done, _ = read_tally(out, done.screen)
+    assert is_done.tolist() == [True, True, True, False]
+    resumed = screened(out)
+    assert_same(resumed.tally, done.tally)
+    assert sorted(path.name for path in out.iterdir()) == sorted(
+        [".lock", BEST, TALLY, "screen.json"]
+    )
+    with pytest.raises(StudyError, match="was begun with another sweep"):
+        screened(out, keep=KEEP + 1)
+
+
+class Lossy(LocalScreener):
+    """Gives a shard up."""
+
+    def tallies(self, screen, shards, progress, stop):
+        for shard, tally in super().tallies(screen, shards, progress, stop):
+            yield shard, "its workers died" if shard == 2 else tally
+
+
+def test_a_lost_shard_is_said_and_retried(whole, tmp_path):
+    _, done = whole
+    lossy = screened(tmp_path / "out", screener=Lossy())
+    assert lossy.lost == {2: "its workers died"}
+    assert lossy.tally.n_designs == 200 - 64
+    assert_same(screened(tmp_path / "out").tally, done.tally)
+
+
+def test_ctrl_c_keeps_what_is_finished(whole, tmp_path, monkeypatch):
+    out, stop = tmp_path / "out", threading.Event()
+
+    class Pressed(LocalScreener):
+        def tallies(self, screen, shards, progress, stop):
+            for answer in super().tallies(screen, shards, progress, stop):
+                yield answer
+                stop.set()
+
+    done = screened(out, screener=Pressed())
+    assert done.is_interrupted and done.is_done.sum() == 1
+    assert not (out / BEST).exists() and not stop.is_set()
+    assert_same(screened(out).tally, whole[1].tally)
+
+
+def test_damaged_tallies_are_refused(whole, tmp_path):
+    out, done = whole
+    good, attributes = read_store(out / TALLY)
+
+    def changed(name, data):
+        stored = {name: Variable(x.data, x.dims, x.units, x.long_name) for name, x in good.items()}
+        stored[name] = stored[name]._replace(data=data)
+        write_store(tmp_path / TALLY, stored, attributes)
+        with pytest.raises(StudyError, match="damaged"):
+            read_tally(tmp_path, done.screen)
+
+    changed("endings", good["endings"].data + 1)
+    changed("row", good["row"].data + 10_000)
+    changed("sketch", -good["sketch"].data)
+    changed("is_done", np.zeros(4, np.int8))
+    (tmp_path / TALLY).write_bytes((out / TALLY).read_bytes()[:3000])
+    with pytest.raises(StudyError):
+        read_tally(tmp_path, done.screen)
+    write_tally(tmp_path, done.screen, done.is_done, done.tally)
+    assert_same(read_tally(tmp_path, done.screen)[1], done.tally)
+
+
+def test_full_model_of_the_same_designs(whole, tmp_path):
+    """The true best ones, without a table of all cases."""
+    full = screened(tmp_path / "full", fidelity="full")
+    assert full.tally.n_designs == 200
+    common = np.intersect1d(full.tally.row, whole[1].tally.row)
+    assert len(common) >= 0.8 * KEEP
+    assert not np.array_equal(full.tally.value, whole[1].tally.value)
+
+
+def test_what_a_screen_cannot_do_is_refused():
+    for more, message in (
+        ({"repeats": 2}, "sweep.repeats = 2"),
+        ({"environments": ["gain"]}, "sweep.environments"),
+        ({"screen": {"keep": 0.5}}, "sweep.screen"),
+        ({"method": "morris", "count": 4, "where": ""}, "sweep.method = 'morris'"),
+        ({"where": "gain > 99"}, "true for none"),
+    ):
+        with pytest.raises(StudyError, match=message):
+            screen_of(parse_sweep(small(SWEEP | more)))
+    with pytest.raises(StudyError, match="structural_rms"):
+        screen_of(SPEC, by="structral_rms")
+    with pytest.raises(StudyError, match="allowed"):
+        screen_of(SPEC, by="structural_rms[link=4]")
+    with pytest.raises(StudyError, match="--keep = 0"):
+        screen_of(SPEC, keep=0)
+
+
+def test_report_says_what_was_found(whole):
+    out, done = whole
+    write_screen_report(out, done)
+    text = text_of((out / "report.html").read_text())
+    assert "200 designs" in text and "actuators saturated" in text and "best.toml" in text
+    lines = summary_lines(done)
+    assert lines[1].startswith(f"the best {KEEP} by structural_rms[link=2][station=2]")
+    assert {"values.png", "influence.png"} <= {path.name for path in out.iterdir()}
+
+
+def test_the_command(tmp_path, capsys):
+    from studies.study.template import toml_text
+
+    file, out = tmp_path / "sweep.toml", tmp_path / "out"
+    file.write_text(toml_text(small(SWEEP)))
+    main(["screen", str(file), "--out", str(out), "--keep", "5"])
+    text = capsys.readouterr().out
+    assert "the best 5 by" in text and f"studies sweep {out / BEST}" in text
+    with pytest.raises(SystemExit) as ended:
+        main(["screen", str(file), "--out", str(out), "--keep", "5"])
+    assert ended.value.code == 2
+    assert "holds a screen already; add --resume" in capsys.readouterr().err
+    main(["screen", str(file), "--out", str(out), "--keep", "5", "--resume", "--quiet"])
