@@ -264,18 +264,19 @@ def _pole_decay(table: CaseTable, structure: Structure, members: np.ndarray) -> 
     return fastest
 
 
-def local_layout(n: int, structure: Structure) -> Layout:
+def local_layout(n: int, structure: Structure, most: int = 0) -> Layout:
     """Chunk shape that suits this process.
 
     Args:
         n: number of cases.
         structure: of the cases.
+        most: cases side by side on a device; 0: as many as suit a sweep.
     """
     devices = len(jax.local_devices())
     # a case's command takes most memory: references at every point of every step
     points = structure.n_steps * (2 * structure.plant_steps + 1)
     lane_bytes = points * structure.n_pose * 8 * 8 + 2**16
-    lanes, unit = most_lanes(), lane_unit()
+    lanes, unit = most or most_lanes(), lane_unit()
     while lanes > unit and devices * lanes * lane_bytes > memory_budget():
         lanes //= 2
     per_device = -(-n // devices)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from rich.console import Console
 
 from studies.engine.chunks import Done, LocalRunner
 from studies.engine.columns import labelled
-from studies.engine.plan import local_layout, plan_groups
+from studies.engine.plan import local_layout, most_lanes, plan_groups
 from studies.engine.progress import Phases, Reporter
 from studies.engine.results import SweepData, direction, metric_values
 from studies.engine.stored import chunk_arrays
@@ -27,6 +28,8 @@ from studies.study.fields import Columns
 
 #: Designs of a shard.
 SHARD = 2**18
+#: Designs side by side: preparing many at once is faster, and the linear model needs little memory.
+LANES = 512
 #: Designs by whose values axes are divided.
 FIRST = 2**12
 
@@ -166,8 +169,9 @@ def shard_tally(
     if not count:
         return total
     is_linear = screen.spec.sweep.fidelity == "linear"
+    lay_out = partial(local_layout, most=max(LANES, most_lanes()))
     groups = plan_groups(
-        table, np.arange(count), local_layout, (screen.metric,), is_linear, is_judged=False
+        table, np.arange(count), lay_out, (screen.metric,), is_linear, is_judged=False
     )
     n_run = 0
     with Phases(Console(quiet=True), ("compile", "run"), is_quiet=True) as phases:
