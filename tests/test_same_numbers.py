@@ -1,5 +1,4 @@
-"""Same seed, same numbers: on any number of cores, in any chunks, with kernel or scan, with narrower
-vectors, and on another Python."""
+"""Same seed, same numbers: on any cores, in any chunks, by kernel or scan, on any Python."""
 
 import os
 import subprocess
