@@ -283,7 +283,10 @@ BEYOND = BETWEEN._replace(default=2.0)
     [
         ({"laws": [LAWS["imsc"]._replace(name="x", channel="wheel")]}, "channel = 'wheel'"),
         ({"laws": [LAWS["imsc"]._replace(name="x", design="imsc")]}, "design = 'imsc'"),
-        ({"laws": [LAWS["imsc"]._replace(name="x", parameters="a")]}, "expected a Parameter"),
+        (
+            {"laws": [LAWS["imsc"]._replace(name="x", parameters="a")]},
+            "expected a tuple of Parameter",
+        ),
         (
             {"laws": [LAWS["imsc"]._replace(name="x", parameters=(BETWEEN, BETWEEN))]},
             "parameter 'share'; expected a unique name",
