@@ -312,16 +312,19 @@ def change_bytes(path, rng):
 def change_words(path, rng):
     """Another value for a number, text or name; a strange line."""
     text = path.read_bytes().decode(errors="replace")
+    path.write_bytes(other_words(text, rng).encode(errors="replace"))
+
+
+def other_words(text, rng):
+    """The same of a text."""
     words = list(re.finditer(r"-?\d[\w.+-]*|\"[^\"\n]*\"|[A-Za-z_]\w*|[\[\]{},:=]", text))
     if not words or rng.random() < 0.15:
         lines = text.splitlines()
         lines.insert(int(rng.integers(len(lines) + 1)), str(rng.choice(LINES)))
-        text = "\n".join(lines)
-    else:
-        word = words[rng.integers(len(words))]
-        other = words[rng.integers(len(words))][0]
-        text = text[: word.start()] + str(rng.choice([*WORDS, other, other])) + text[word.end() :]
-    path.write_bytes(text.encode(errors="replace"))
+        return "\n".join(lines)
+    word = words[rng.integers(len(words))]
+    other = words[rng.integers(len(words))][0]
+    return text[: word.start()] + str(rng.choice([*WORDS, other, other])) + text[word.end() :]
 
 
 def change_json(path, rng):
