@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 
 class PartError(ValueError):
@@ -45,6 +45,12 @@ def check_parameters(place: str, parameters: Iterable[Parameter]) -> None:
                 f"allowed: {x.low:g} to {x.high:g}"
             )
         seen.add(x.name)
+
+
+def is_real(value: Any) -> bool:
+    """Whether a value is a real number, or an array of them."""
+    kind = getattr(getattr(value, "dtype", None), "kind", "")
+    return isinstance(value, (int, float)) or (kind != "" and kind in "fiu")
 
 
 class Named(Protocol):
