@@ -1,5 +1,6 @@
 """Inputs that `tests/fuzz.py` has found to end in something other than a message."""
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,8 @@ from scipy.io import savemat
 
 from studies.errors import StudyError
 from studies.fitting.tables import read_columns
+from tests.fuzz import BINARY, TARGETS
+from tests.mutations import other_words
 
 DATA = Path(__file__).parent / "data" / "fuzzed"
 
@@ -24,3 +27,16 @@ def test_names_of_variables_are_not_those_of_arguments(tmp_path):
     found = read_columns("x.mat", tmp_path, "file")
     assert list(found) == ["file", "allow_pickle"]
     np.testing.assert_array_equal(found["allow_pickle"], values + 1j)
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_a_target_reads_its_seeds_and_changes_of_them(tmp_path, name):
+    """So that the campaign, which needs another package, still runs when it is wanted."""
+    target, rng = TARGETS[name], np.random.default_rng(0)
+    seeds, read = target.seeds(), target.make(tmp_path)
+    for seed in seeds[:2]:
+        read(seed)
+    for _ in range(6 if name not in BINARY else 0):
+        text = other_words(seeds[0].decode(), rng)
+        with suppress(StudyError):
+            read(text.encode(errors="replace"))

@@ -3,9 +3,11 @@
 The short campaign reads what needs no compiled program; the long one everything that is shipped.
 """
 
+import io
 import json
 import os
 import shutil
+import sys
 import time
 
 import h5py
@@ -262,6 +264,14 @@ def test_a_lock_that_is_a_pipe_is_not_waited_for(tmp_path):
     refused = pytest.raises(StudyError, match="cannot write there")
     with mutations.time_limit(5), refused, locked_folder(tmp_path, "sweep"):
         pass
+
+
+def test_results_are_printed_in_any_encoding(sweep, monkeypatch):
+    printed = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(printed, encoding="ascii"))
+    main(["show", str(sweep)])
+    sys.stdout.flush()
+    assert rb"\xb5m" in printed.getvalue()
 
 
 def test_results_that_are_no_file_are_no_results(tmp_path, sweep, capsys):
