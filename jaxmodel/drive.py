@@ -7,7 +7,7 @@ from typing import NamedTuple
 from jaxmodel.case import Drive, Structure
 from jaxmodel.controller import soft_limit
 from jaxmodel.drives import DRIVES
-from jaxmodel.drives.contract import DriveState, SliderError
+from jaxmodel.drives.contract import DriveState, SliderError, drive_force
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 
@@ -41,7 +41,7 @@ def motor_force(
     if force is None:
         law, error = DRIVES[structure.drive], _error(reference, rho, rho_rate)
         memory = None if law.update is None else jnp.zeros_like(rho)
-        force = law.force(drive, memory, error, structure.is_smooth)
+        force = drive_force(law, drive, memory, error, structure.is_smooth)
     if reference.feedforward is not None:
         force = force + reference.feedforward
     return soft_limit(force, drive.force_limit, structure.is_smooth)
@@ -92,7 +92,7 @@ def drive_step(
     law = DRIVES[structure.drive]
 
     def sample(memory: Array | None, error: SliderError, applied: Array) -> DriveState:
-        force = law.force(drive, memory, error, structure.is_smooth)
+        force = drive_force(law, drive, memory, error, structure.is_smooth)
         if law.update is None or memory is None:
             return DriveState(force, memory)
         return DriveState(force, law.update(drive, memory, error, applied, period))

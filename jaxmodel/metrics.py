@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from jaxmodel.control import efficient_modal_control
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
-from jaxmodel.table import PartError, Table
+from jaxmodel.table import PartError, Table, is_real
 
 
 class Sample(NamedTuple):
@@ -175,6 +175,8 @@ def accumulate(totals: Totals, instant: Instant) -> Totals:
     definitions = {total.name: total for metric in METRICS.values() for total in metric.totals}
     after = {name: definitions[name].update(totals, instant) for name in totals}
     for name, new in after.items():
+        if not all(hasattr(x, "dtype") or is_real(x) for x in jax.tree.leaves(new)):
+            raise PartError(f"total {name!r}: {new!r} after a sample; expected numbers")
         shapes = [jax.tree.map(jnp.shape, x) for x in (totals[name], new)]
         if shapes[0] != shapes[1]:
             raise PartError(f"total {name!r}: shape {shapes[1]} after a sample, {shapes[0]} before")
@@ -195,12 +197,6 @@ def finish(totals: Totals, ending: Ending) -> Metrics:
         if jnp.ndim(value) != len(dims):
             raise PartError(f"metric {name!r}: {jnp.ndim(value)} axes found; its dims are {dims}")
     return metrics
-
-
-def is_real(value: Any) -> bool:
-    """Whether a value is a real number, or an array of them."""
-    kind = getattr(getattr(value, "dtype", None), "kind", "")
-    return isinstance(value, (int, float)) or (kind != "" and kind in "fiu")
 
 
 def check_metric(metric: Metric) -> None:

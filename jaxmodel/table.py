@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 
 class PartError(ValueError):
@@ -25,9 +25,18 @@ class Parameter(NamedTuple):
 def check_parameters(place: str, parameters: Iterable[Parameter]) -> None:
     """Raise PartError for parameters that are invalid; `place` names their entry in messages."""
     seen: set[str] = set()
+    if not isinstance(parameters, (tuple, list)):
+        raise PartError(f"{place}: parameters = {parameters!r}; expected a tuple of Parameter")
     for x in parameters:
         if not isinstance(x, Parameter):
             raise PartError(f"{place}: parameters: {x!r}; expected a Parameter")
+        for kind, expected, fields in (
+            (str, "a text", (x.name, x.unit, x.text)),
+            ((int, float), "a number", (x.default, x.low, x.high)),
+        ):
+            for value in fields:
+                if not isinstance(value, kind):
+                    raise PartError(f"{place}: {value!r} in {x!r}; expected {expected}")
         if not x.name.isidentifier() or x.name in seen:
             raise PartError(f"{place}: parameter {x.name!r}; expected a unique name")
         if not x.low <= x.default <= x.high:
@@ -36,6 +45,12 @@ def check_parameters(place: str, parameters: Iterable[Parameter]) -> None:
                 f"allowed: {x.low:g} to {x.high:g}"
             )
         seen.add(x.name)
+
+
+def is_real(value: Any) -> bool:
+    """Whether a value is a real number, or an array of them."""
+    kind = getattr(getattr(value, "dtype", None), "kind", "")
+    return isinstance(value, (int, float)) or (kind != "" and kind in "fiu")
 
 
 class Named(Protocol):
@@ -90,6 +105,8 @@ class Table(Mapping[str, _Entry], Generic[_Entry]):
         if not isinstance(entry, kind):
             raise PartError(f"{self.kind} {entry!r}: expected a {kind.__name__}")
         name = entry.name
+        if not isinstance(name, str):
+            raise PartError(f"{self.kind} {name!r}: expected a text as its name")
         plain = name.replace("-", "_")
         if not plain.isidentifier() or name.startswith("_") or hasattr(dict, name):
             raise PartError(f"{self.kind} {name!r}: letters, digits, - and _ are allowed in a name")

@@ -18,6 +18,7 @@ from studies import sources
 from studies.cache import chosen_folder, is_usable
 from studies.errors import StudyError
 from studies.publish import replacing
+from studies.reading import read_json
 
 if TYPE_CHECKING:
     from studies.study.spec import Study
@@ -60,7 +61,8 @@ def keep(study: Study, passport: Passport) -> None:
         return
     # a full disk must not turn a verification into a failure
     with suppress(StudyError), replacing(_file(study, folder)) as temporary:
-        temporary.write_text(json.dumps(passport._asdict()), encoding="utf-8")
+        content = passport._asdict()
+        temporary.write_text(json.dumps(content | {"digest": _hash(content)}), encoding="utf-8")
 
 
 def find(study: Study | None) -> Passport | None:
@@ -68,7 +70,9 @@ def find(study: Study | None) -> Passport | None:
     if study is None:
         return None
     try:
-        data: dict[str, Any] = json.loads(_file(study, chosen_folder()).read_text("utf-8"))
+        data: dict[str, Any] = read_json(_file(study, chosen_folder()))
+        if data.pop("digest") != _hash(data):
+            return None
         return Passport(
             title=_plain(data["title"]),
             passed=int(data["passed"]),
@@ -78,8 +82,12 @@ def find(study: Study | None) -> Passport | None:
             version=_plain(data["version"]),
             processor=_plain(data["processor"]),
         )
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None  # not there, or damaged: not verified
+
+
+def _hash(content: dict[str, Any]) -> str:
+    return sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _plain(text: object) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 import shutil
@@ -113,6 +114,34 @@ def publish(out: str | Path, stale: Iterable[str] = ()) -> Iterator[Path]:
     finally:
         if is_new and out.is_dir() and not any(out.iterdir()):
             out.rmdir()
+
+
+#: Of errors for want of room.
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+@contextmanager
+def working_folder() -> Iterator[Path]:
+    """Yield a folder for files that only this process needs.
+
+    Raises:
+        StudyError: there is none, or it has no room.
+    """
+    try:
+        folder = tempfile.TemporaryDirectory()
+    except OSError as error:
+        raise StudyError(_no_room("temporary files", error)) from None
+    with folder as name:
+        try:
+            yield Path(name)
+        except OSError as error:
+            if error.errno not in _FULL:
+                raise
+            raise StudyError(_no_room(name, error)) from None
+
+
+def _no_room(where: str, error: OSError) -> str:
+    return f"{where}: cannot write ({error.strerror}); name a folder with room in TMPDIR"
 
 
 def announce(console: Console, report: Path, more: str = "") -> None:

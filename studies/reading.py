@@ -143,13 +143,13 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
     return parse_npz(read_bytes(path))
 
 
-def parse_npz(packed: bytes) -> dict[str, np.ndarray]:
-    """The same from the file's contents; errors as `read_npz`."""
+def parse_npz(packed: bytes, most: int = LARGEST) -> dict[str, np.ndarray]:
+    """The same from the file's contents, up to `most` bytes; errors as `read_npz`."""
     try:
         with zipfile.ZipFile(BytesIO(packed)) as archive:
             members = archive.infolist()
-            if sum(member.file_size for member in members) > LARGEST:
-                raise ValueError(f"unpacks to more than {LARGEST / 2**20:g} MiB")
+            if sum(member.file_size for member in members) > most:
+                raise ValueError(f"unpacks to more than {most / 2**20:g} MiB")
             return {
                 member.filename.removesuffix(".npy"): _array(archive.read(member))
                 for member in members

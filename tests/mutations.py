@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from io import StringIO
 from pathlib import Path
 from typing import NamedTuple
+from unittest.mock import patch
 
 import h5py
 import numpy as np
@@ -19,14 +20,27 @@ from rich.console import Console
 from scipy.io import loadmat, savemat
 
 from jaxmodel.metrics import METRICS
+from studies import passport
+from studies.cache import VARIABLE
+from studies.cluster.connect import written_address
+from studies.commission.spec import load_measured
 from studies.engine.columns import PER_CASE, label_of
 from studies.engine.controller import fixed_controller
 from studies.engine.design import load_design
-from studies.engine.folder import BASELINE, MANIFEST, RESULTS, file_hash, make_manifest, open_folder
+from studies.engine.folder import (
+    BASELINE,
+    FIT,
+    MANIFEST,
+    RESULTS,
+    file_hash,
+    make_manifest,
+    open_folder,
+)
 from studies.engine.folder import finished_cases as finished
-from studies.engine.results import baseline_id, read_sweep
+from studies.engine.results import DIGEST, baseline_digest, baseline_id, read_sweep
 from studies.engine.stored import manifest_attributes, merge
 from studies.errors import StudyError
+from studies.explorer.page import explorer_page
 from studies.export.document import (
     FORMAT,
     Document,
@@ -38,17 +52,24 @@ from studies.export.document import (
     study_hash,
     to_json,
 )
+from studies.fitting.explore import explore_fit
 from studies.fitting.spec import FileEntry, load_fit
 from studies.fitting.tables import column, read_columns
+from studies.kernels import compilation
+from studies.kernels.compilation import ObjectCache, _key
+from studies.passport import Passport
 from studies.space.spec import load_sweep, parse_sweep
 from studies.space.table import build_table
 from studies.store import Variable, write_store
 from studies.study.files import READY, read_toml
-from studies.study.spec import load_study
+from studies.study.spec import Study, load_study
 from studies.sweeps.show import print_cases, ranked_cases, show
+from studies.tuning import explore as tuning_explorer
+from studies.tuning.folder import RESULTS as TUNED
 from studies.tuning.folder import open_tuning, save_progress
 from studies.tuning.optimise import Progress, is_compatible, start_families
 from studies.tuning.spec import load_tuning
+from tests.fits import RESPONSE, blank
 from tests.sweeps import small
 from tests.tunings import EVERY_KIND, tuning
 
@@ -83,7 +104,8 @@ class Kind(NamedTuple):
     """Files of one kind."""
 
     make: Callable  # writes originals into a folder, returns their paths: files or folders
-    read: Callable  # reads one of them, as commands do
+    read: Callable  # reads one of them, as commands do; of sealed ones, returns what it has read
+    is_sealed: bool = False  # what is read must be as it was written: some of it, or a message
 
 
 # --- originals ------------------------------------------------------------------------------------
@@ -193,7 +215,8 @@ def sweep_folder(folder):
                     dims, *label = label_of(metric)
                     values = rng.uniform(1, 2, tuple(3 for _ in dims))
                     baseline[metric] = Variable(values, dims, *label)
-                write_store(out.path / BASELINE, baseline, {"case_id": baseline_id(spec)})
+                seal = {"case_id": baseline_id(spec), DIGEST: baseline_digest(baseline)}
+                write_store(out.path / BASELINE, baseline, seal)
     return [folder / "whole", folder / "part"]
 
 
@@ -207,6 +230,78 @@ def tuning_folder(folder):
         save_progress(out / "progress.npz", Progress(**at | {"descent": (np.zeros(3),)}))
     shutil.copy(READY / "paper.toml", out / "tuned.toml")
     return [out]
+
+
+def tuned_folder(folder):
+    """A finished tuning with made-up numbers, of which nothing is to be replayed."""
+    spec = tuning(EVERY_KIND, starts=2, iterations=3)
+    (folder / "tuned").mkdir()
+    rng, k, p = np.random.default_rng(0), 2, len(spec.free.names)
+    numbers = {"objective": (k,), "linear_residual": (k,), "is_frozen": (k,), "value": (k, p)}
+    numbers |= {"patch_center": (k, 3, 3)}
+    axes = ("start", "free", "mode")
+    data = {
+        name: Variable(1 + rng.random(shape), axes[: len(shape)], "1", name)
+        for name, shape in numbers.items()
+    }
+    data["patch_center"] = data["patch_center"]._replace(dims=("start", "link", "patch"))
+    data["is_frozen"] = Variable(np.ones(k, np.int8), ("start",), "1", "is_frozen")
+    texts = {"start_family": [spec.families[0].name] * k, "free": spec.free.names}
+    texts["free_unit"] = ["1"] * p
+    for name, text in texts.items():
+        axis = ("start",) if name == "start_family" else ("free",)
+        data[name] = Variable(np.array(text), axis, "1", name)
+    write_store(folder / "tuned" / TUNED, data, {"tuning": json.dumps(spec.data)})
+    return [folder / "tuned"]
+
+
+def fit_folder(folder):
+    """A finished fit with made-up numbers."""
+    (folder / "fitted").mkdir()
+    rng, names = np.random.default_rng(0), ["link.damping_ratio", "drive.kp"]
+    sizes = {"optimum": ("start", 2), "machine": ("sample", 5), "value": (), "sigma": ()}
+    data = {
+        name: Variable(rng.random((*of[1:], 2)), (*of[:1], "number"), "1", name)
+        for name, of in sizes.items()
+    }
+    data["optimum_rise"] = Variable(np.zeros(2), ("start",), "1", "rise")
+    data["correlation"] = Variable(np.eye(2), ("number", "other"), "1", "correlation")
+    data["number"] = Variable(np.array(names), ("number",), "1", "number")
+    study = load_study(READY / "paper.toml").model_dump_json()
+    write_store(folder / "fitted" / FIT, data, {"study": study})
+    return [folder / "fitted"]
+
+
+def measured_file(folder):
+    """A commissioning, and its measurements."""
+    blank(folder)
+    entry = "\n".join(f"{key} = {json.dumps(value)}" for key, value in RESPONSE.items())
+    (folder / "measured.toml").write_text(
+        '[control]\nmodes = 1\n[commission]\ntarget = "c"\ngain_margin = 2.0\n[tune]\nstarts = 2\n'
+        '[fit]\nstarts = 2\n[fit.free]\n"load.mass" = { from = 0.0, to = 1.0 }\n'
+        f"[[fit.data]]\n{entry}\n"
+    )
+    return [folder / "measured.toml"]
+
+
+def kept_program(folder):
+    """A program in the cache."""
+    with cached_in(folder):
+        ObjectCache("program", "x").keep(bytes(range(256)))
+    return sorted(folder.glob("program-*"))
+
+
+def kept_outcome(folder):
+    """An outcome of `studies verify`."""
+    with cached_in(folder):
+        found = Passport("x", 11, 13, ("one", "two"), "2026-01-01", "1.0", "processor")
+        passport.keep(Study(), found)
+    return sorted(folder.glob("passport-*"))
+
+
+def scheduler_file(folder):
+    (folder / "cluster.json").write_text('{"address": "tcp://127.0.0.1:8786", "type": "Scheduler"}')
+    return [folder / "cluster.json"]
 
 
 # --- readers --------------------------------------------------------------------------------------
@@ -257,6 +352,60 @@ def read_tuning_folder(path):
             is_compatible(spec, at)
 
 
+def read_sealed_sweep(path):
+    """Metrics of each finished case, and the baseline's."""
+    data = read_sweep(path)
+    rows = np.array(data.table.case_id)
+    found = {
+        (name, case): np.asarray(data[name])[k].tobytes()
+        for name in METRICS
+        if name in data.variables
+        for k, case in enumerate(rows)
+        if data["status"][k] >= 0
+    }
+    return found | {
+        (name, "baseline"): np.asarray(x.data).tobytes()
+        for name, x in data.baseline.items()
+        if name in METRICS
+    }
+
+
+def read_tuned_folder(path):
+    with patch.object(tuning_explorer, "MOST_REPLAYS", 0):
+        explorer_page(tuning_explorer.explore_tuning(path, lambda *_: None))
+
+
+def read_fit_folder(path):
+    explorer_page(explore_fit(path, lambda *_: None))
+
+
+@contextmanager
+def cached_in(folder):
+    """The cache in a folder, for what is read and written here."""
+    _key.cache_clear()
+    with (
+        patch.dict(os.environ, {VARIABLE: str(folder)}),
+        patch.object(compilation, "cache_folder", lambda: str(folder)),
+    ):
+        yield
+    _key.cache_clear()
+
+
+def read_program(path):
+    key = path.with_name("key")
+    if not key.exists():  # of the originals, beside which this is a copy
+        shutil.copy(path.parents[1] / "originals" / "key", key)
+    with cached_in(path.parent):
+        code = ObjectCache("program", "x").take()
+    return {} if code is None else {"code": code}
+
+
+def read_outcome(path):
+    with cached_in(path.parent):
+        found = passport.find(Study())
+    return {} if found is None else {"outcome": found}
+
+
 KINDS = {
     "study": Kind(ready("study"), load_study),
     "sweep": Kind(ready("sweep"), read_sweep_file),
@@ -269,6 +418,13 @@ KINDS = {
     "tuning folder": Kind(tuning_folder, read_tuning_folder),
     "gains": Kind(gains, import_study),
     "document": Kind(bare_gains, read_document),
+    "commissioning": Kind(measured_file, load_measured),
+    "tuned folder": Kind(tuned_folder, read_tuned_folder),
+    "fit folder": Kind(fit_folder, read_fit_folder),
+    "scheduler": Kind(scheduler_file, lambda path: written_address(str(path))),
+    "chunks": Kind(sweep_folder, read_sealed_sweep, True),
+    "program": Kind(kept_program, read_program, True),
+    "outcome": Kind(kept_outcome, read_outcome, True),
 }
 
 
@@ -312,16 +468,19 @@ def change_bytes(path, rng):
 def change_words(path, rng):
     """Another value for a number, text or name; a strange line."""
     text = path.read_bytes().decode(errors="replace")
+    path.write_bytes(other_words(text, rng).encode(errors="replace"))
+
+
+def other_words(text, rng):
+    """The same of a text."""
     words = list(re.finditer(r"-?\d[\w.+-]*|\"[^\"\n]*\"|[A-Za-z_]\w*|[\[\]{},:=]", text))
     if not words or rng.random() < 0.15:
         lines = text.splitlines()
         lines.insert(int(rng.integers(len(lines) + 1)), str(rng.choice(LINES)))
-        text = "\n".join(lines)
-    else:
-        word = words[rng.integers(len(words))]
-        other = words[rng.integers(len(words))][0]
-        text = text[: word.start()] + str(rng.choice([*WORDS, other, other])) + text[word.end() :]
-    path.write_bytes(text.encode(errors="replace"))
+        return "\n".join(lines)
+    word = words[rng.integers(len(words))]
+    other = words[rng.integers(len(words))][0]
+    return text[: word.start()] + str(rng.choice([*WORDS, other, other])) + text[word.end() :]
 
 
 def change_json(path, rng):
@@ -486,12 +645,15 @@ def attack(kind, found, folder, seed):
     work.mkdir()
     path = work / original.name
     shutil.copytree(original, path) if original.is_dir() else shutil.copy(original, path)
-    for beside in original.parent.glob("*.csv") if kind == "fit" else ():
+    for beside in original.parent.glob("*.csv") if kind in ("fit", "commissioning") else ():
         shutil.copy(beside, work)
-    change(path, rng)
+    _, read, is_sealed = KINDS[kind]
+    change(rng.choice(sorted(path.rglob("*.h5"))) if is_sealed and path.is_dir() else path, rng)
     try:
         with time_limit(LIMIT):
-            KINDS[kind].read(Path(path))
+            answer = read(Path(path))
+            if is_sealed:
+                assert answer.items() <= read(original).items(), "another answer than was written"
     except StudyError as error:
         fault = "" if str(error) else "an empty message"
     except (Exception, Hang) as error:

@@ -20,6 +20,7 @@ from studies.engine.runs import run_study
 from studies.errors import StudyError
 from studies.study.spec import paper_study
 from tests.pages import Page, text_of
+from tests.test_cli import refused
 from tests.test_cli import run as command
 
 SETTINGS = ((0.05, "ei"), (0.03, "none"))
@@ -287,6 +288,12 @@ def test_claims_are_counted():
 def test_designs_without_subsets_are_refused(tmp_path, fields, message):
     with pytest.raises(StudyError, match=message):
         run.run_atlas(small_study(**fields), tmp_path / "out", False, Console(file=io.StringIO()))
+    assert not (tmp_path / "out").exists()
+
+
+def test_machines_of_two_links_are_refused(tmp_path, capsys):
+    said = refused(capsys, "atlas", "five_bar", "--out", tmp_path / "out")
+    assert "machine.kind = 'five_bar'; allowed: prrr, rrr: machines of 3 links" in said
     assert not (tmp_path / "out").exists()
 
 

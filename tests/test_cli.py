@@ -294,7 +294,7 @@ def test_shares_of_modes_are_what_their_frequencies_gain_from_stiffness(thicknes
 
 
 def test_modes_at_another_pose_differ(capsys):
-    moved = run(capsys, "modes", "--modes", 2, "--pose", 0.01, 0.005, 0.6, "--json")
+    moved = run(capsys, "modes", "--modes", 2, "--pose", "0.01,0.005,0.6", "--json")
     home = run(capsys, "modes", "--modes", 2, "--json")
     moved, home = (np.array(columns(json.loads(out))[0]) for _, out, _ in (moved, home))
     assert 1e-4 < np.max(np.abs(moved / home - 1)) < 0.2
@@ -309,7 +309,7 @@ def test_modes_of_a_study_are_those_of_its_own_machine(capsys, tmp_path):
     np.testing.assert_allclose(ratio, 0.01, rtol=1e-6)
     study = tmp_path / "loaded.toml"
     study.write_text("[load]\nwrench = [20, 0, 0]\n[motion]\nmove_time = [0.1, 0.1, 0.1, 0.2]\n")
-    out = run(capsys, "modes", study, "--kd", 0, "--pose", 0, 0, np.pi / 6, "--json")[1]
+    out = run(capsys, "modes", study, "--kd", 0, "--pose", f"0,0,{np.pi / 6}", "--json")[1]
     np.testing.assert_allclose(
         columns(json.loads(out))[0][3:6], [108.19, 118.16, 118.47], rtol=2e-4
     )  # finite elements
@@ -326,13 +326,14 @@ def test_modes_of_a_study_are_those_of_its_own_machine(capsys, tmp_path):
         (("--modes", 17), "link.modes = 17; allowed: a whole number >= 1 and <= 16 [1]"),
         (("--basis", "pinned_pined"), "did you mean 'pinned_pinned'?"),
         (("--locked", "--basis", "pinned_free"), "allowed: pinned_pinned or loaded, where"),
-        (("--pose", 1, 2), "Option '--pose' requires 3 arguments"),
-        (("--pose", "nan", 0, 0.5), "= nan; allowed: a finite number"),
+        (("--pose", "1,x"), "--pose = '1,x'; allowed: numbers with commas between them"),
+        (("--pose", "1,2"), "= [1.0, 2.0]; allowed: 3 finite numbers"),
+        (("--pose", "nan,0,0.5"), "= nan; allowed: a finite number"),
         (
-            ("--modes", 2, "--pose", 0.5, 0, 0.5),
+            ("--modes", 2, "--pose", "0.5,0,0.5"),
             "guide_offsets moves it) (here: pose out of reach; link 1 is 0.2 m long",
         ),
-        (("--modes", 2, "--pose", 0.09526, 0.055, -1.047), "(here: singular pose: a link along"),
+        (("--modes", 2, "--pose", "0.09526,0.055,-1.047"), "(here: singular pose: a link along"),
         (("--poze", 1, 2, 3), "No such option: --poze (Possible options:"),
     ],
 )

@@ -9,6 +9,7 @@ import time
 from contextlib import ExitStack
 from itertools import islice
 
+import dask
 import jax
 import numpy as np
 import pytest
@@ -192,6 +193,26 @@ def test_bad_options_are_refused(capsys, tmp_path, cluster, monkeypatch):
     assert "--worker-timeout = 0.0" in refused(capsys, *sweep, *scheduler, "--worker-timeout", 0)
     assert "plans for this process" in refused(capsys, *sweep, *scheduler, "--dry-run")
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("host", "is_said"), [("127.0.0.1", False), ("localhost", False), ("192.0.2.1", True)]
+)
+def test_a_scheduler_without_encryption_is_named(monkeypatch, host, is_said):
+    monkeypatch.setattr(connect, "PATIENCE", 0.1)
+    said = []
+    workers = Workers(f"tcp://{host}:1", None, 60.0)
+    with pytest.raises(StudyError, match="no scheduler answers"), connected(workers, said.append):
+        pass
+    assert bool(said) == is_said and all("not encrypted" in text for text in said)
+
+
+def test_a_scheduler_without_encryption_is_refused_where_it_is_required(cluster):
+    workers = Workers(str(cluster.scheduler), None, 60.0)
+    required = dask.config.set({"distributed.comm.require-encryption": True})
+    refused = pytest.raises(StudyError, match="no scheduler answers .*encryption")
+    with required, refused, connected(workers, print):
+        pass
 
 
 def test_without_dask_the_options_say_what_to_install(capsys, monkeypatch, tmp_path):

@@ -230,6 +230,17 @@ def test_a_stage_is_not_done_twice(monkeypatch, tmp_path):
         run_commission(parse_measured(other), tmp_path / "out", True)
 
 
+@pytest.mark.parametrize("name", ["fit/fit.json", "design.toml", "answers.json"])
+def test_a_changed_answer_is_refused(monkeypatch, name, tmp_path):
+    Pretended(monkeypatch)
+    commissioned(tmp_path / "out")
+    with (tmp_path / "out" / name).open("a") as file:
+        file.write("x")
+    refused = pytest.raises(StudyError, match=f"{name}: damaged")
+    with refused:
+        run_commission(parse_measured(data()), tmp_path / "out", True)
+
+
 def test_other_data_are_another_commissioning(monkeypatch, tmp_path):
     Pretended(monkeypatch)
     file = tmp_path / "response.csv"

@@ -13,13 +13,15 @@ import numpy as np
 import pytest
 
 from jaxmodel.drives import DRIVES
+from jaxmodel.drives.contract import DriveLaw
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law, acting_channels, modal_feedback
-from jaxmodel.metrics import METRICS, Metric, is_real
-from jaxmodel.table import Parameter, Table
+from jaxmodel.metrics import METRICS, Metric, Total
+from jaxmodel.table import Parameter, PartError, Table, is_real
 from studies import config, sources
 from studies.cli import main
 from studies.engine.columns import PER_CASE
+from studies.engine.design import Design
 from studies.engine.executor import Executor
 from studies.engine.folder import DECISIVE
 from studies.engine.margins import judge_loops
@@ -27,7 +29,9 @@ from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.results import read_sweep
 from studies.engine.runs import run_study
 from studies.errors import StudyError
-from studies.export.targets import TARGETS
+from studies.export.job import ExportResult
+from studies.export.run import export_design
+from studies.export.targets import TARGETS, Target
 from studies.extensions import VARIABLE, extend
 from studies.space.methods import METHODS
 from studies.space.spec import parse_sweep
@@ -35,7 +39,7 @@ from studies.space.table import build_table
 from studies.store import read_store
 from studies.study.cases import build_case, build_structure
 from studies.study.labels import RESERVED
-from studies.study.spec import parse_study
+from studies.study.spec import paper_study, parse_study
 from studies.study.template import study_template
 
 DOCS = Path(__file__).parents[1] / "docs" / "how-to" / "own-parts.md"
@@ -283,7 +287,10 @@ BEYOND = BETWEEN._replace(default=2.0)
     [
         ({"laws": [LAWS["imsc"]._replace(name="x", channel="wheel")]}, "channel = 'wheel'"),
         ({"laws": [LAWS["imsc"]._replace(name="x", design="imsc")]}, "design = 'imsc'"),
-        ({"laws": [LAWS["imsc"]._replace(name="x", parameters="a")]}, "expected a Parameter"),
+        (
+            {"laws": [LAWS["imsc"]._replace(name="x", parameters="a")]},
+            "expected a tuple of Parameter",
+        ),
         (
             {"laws": [LAWS["imsc"]._replace(name="x", parameters=(BETWEEN, BETWEEN))]},
             "parameter 'share'; expected a unique name",
@@ -303,6 +310,40 @@ def test_parts_that_do_not_keep_their_contract_are_refused(part, message):
     with pytest.raises(StudyError, match=re.escape(message)):
         extend(**part)
     assert "x" not in LAWS and "x" not in METRICS
+
+
+@pytest.mark.parametrize(
+    ("force", "message"),
+    [
+        (None, "drive 'bad': force returns None; expected real numbers of shape (3,)"),
+        ("x", "drive 'bad': force returns 'x'"),
+        (np.zeros(5), "expected real numbers of shape (3,)"),
+        (np.full(3, np.nan), "drive.kind = 'bad'; allowed: a drive whose force has finite slopes"),
+    ],
+)
+def test_drives_give_forces(monkeypatch, force, message):
+    def answer(drive, memory, error, is_smooth):
+        return force * error.position if np.shape(force) == (3,) else force
+
+    monkeypatch.setitem(DRIVES._entries, "bad", DriveLaw("bad", "bad", answer))
+    study = parse_study(tomllib.loads(SMALL)).change(drive__kind="bad")
+    with pytest.raises((StudyError, PartError), match=re.escape(message)):
+        run_study(study, has_record=False)
+
+
+def test_totals_are_numbers(monkeypatch):
+    text = Total("text", (), lambda totals, at: "x")
+    bad = Metric("bad", (), "m", "bad", (text,), lambda totals, ending: totals["text"])
+    monkeypatch.setitem(METRICS._entries, "bad", bad)
+    with pytest.raises(PartError, match="total 'text': 'x' after a sample; expected numbers"):
+        run_study(parse_study(tomllib.loads(SMALL)), has_record=False)
+
+
+@pytest.mark.parametrize("result", [None, ExportResult(None, None, None)])
+def test_targets_give_texts(monkeypatch, tmp_path, result):
+    monkeypatch.setitem(TARGETS._entries, "bad", Target("bad", "bad", lambda job: result))
+    with pytest.raises(StudyError, match="--target bad: it returns .*; expected an ExportResult"):
+        export_design(Design(paper_study(), {}), "bad", tmp_path / "out")
 
 
 @pytest.mark.parametrize("value", [None, "a", 1j, np.array(["a"]), np.ones(2) * 1j])

@@ -338,7 +338,7 @@ def test_what_breaks_the_contract_of_drives_is_refused():
     for wrong, message in (
         (good._replace(name="x", force=3), "force = 3; expected a function"),
         (good._replace(name="x", is_sampled=False), "only sampled drives have a memory"),
-        (good._replace(name="x", parameters="a"), "expected a Parameter"),
+        (good._replace(name="x", parameters="a"), "expected a tuple of Parameter"),
         (good._replace(text="another"), "this name is taken"),
     ):
         with pytest.raises(StudyError, match=message):

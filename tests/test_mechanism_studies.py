@@ -125,6 +125,17 @@ def test_a_mechanism_of_ones_own_has_the_accelerations_of_its_lagrangian(gantry)
     assert len(rows) >= 4 and all(row.is_passed for row in rows if not row.left_out)
 
 
+def test_a_pose_has_as_many_numbers_as_the_platform(capsys):
+    lowest = []
+    for pose in ("0,0.25", "0.02,0.24"):
+        main(["modes", "five_bar", "--pose", pose, "--json"])
+        lowest.append(json.loads(capsys.readouterr().out)["modes"][0]["frequency_hz"])
+    assert lowest[0] != pytest.approx(lowest[1], rel=1e-3)
+    with pytest.raises(SystemExit):
+        main(["modes", "five_bar", "--pose", "0,0.25,0"])
+    assert "allowed: 2 finite numbers" in capsys.readouterr().err
+
+
 def test_modes_of_two_links_are_named(gantry):
     study = Study().change(machine__kind=gantry, link__modes=2)
     modes = studies.machine_modes(study)

@@ -71,6 +71,7 @@ def test_cards_are_listed(capsys):
     "arguments, message",
     [
         (("zhang_2061", "--out", "OUT"), "NAME = 'zhang_2061'; allowed: .*did you mean 'zhang_201"),
+        (("rrr",), "NAME = 'rrr'; allowed: .*did you mean 'rrr_2016'?"),
         (("zhang_2016",), "--out: missing"),
         (("--out", "OUT"), "NAME: missing; allowed: zhang_2016"),
     ],

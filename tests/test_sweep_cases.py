@@ -347,6 +347,11 @@ REFUSED = [
     ),
     ({"axes": {"run.duration": [100.0], "electronics.sample_rate_hz": [1e6]}}, "1e+08 samples"),
     (
+        {"axes": {"control.laws.ppf.filter_damping": [0.1, 0.2]}},
+        "no case selects the part whose field",
+    ),
+    ({"axes": {"machine.kinds.rrr.crank_length": [0.1, 0.2]}}, "no case selects the part whose"),
+    (
         {
             "method": "sobol",
             "count": 4,
@@ -369,6 +374,14 @@ def test_a_bad_sweep_is_refused_in_one_clear_line(sweep, words):
     message = str(caught.value)
     assert words in message, message
     assert "\n" not in message and len(message) < 1200
+
+
+@pytest.mark.parametrize("values", [[0.5, 0.6], {"from": 0.5, "to": 0.6, "count": 3}])
+@pytest.mark.parametrize("name", ["guide_side", "slider_mass", "guide_offsets[1]"])
+def test_an_axis_that_the_mechanism_does_not_read_is_refused(name, values):
+    sweep = {"axes": {f"machine.{name}": values}}
+    with pytest.raises(StudyError, match=r"machine.* = .*: machine.kind = 'rrr' has no such part"):
+        build_table(parse_sweep({"machine": {"kind": "rrr"}, "sweep": sweep}))
 
 
 @pytest.mark.parametrize("depth", [30, 300, 3000])

@@ -3,9 +3,11 @@
 The short campaign reads what needs no compiled program; the long one everything that is shipped.
 """
 
+import io
 import json
 import os
 import shutil
+import sys
 import time
 
 import h5py
@@ -14,6 +16,7 @@ import pytest
 
 from studies.cli import main
 from studies.engine.folder import (
+    BASELINE,
     LOCK,
     MANIFEST,
     RESULTS,
@@ -32,19 +35,22 @@ from tests.mutations import KINDS, Hang, attack, originals
 
 #: Cases of each kind in the short campaign, and in the long one.
 SHORT = {"study": 45, "sweep": 35, "document": 30, "measurement": 25, "controller": 20}
-SHORT |= {"sweep folder": 6, "MATLAB file": 3}
-LONG = {"study": 500, "sweep": 450, "tuning": 400, "fit": 400, "controller": 300, "gains": 200}
-LONG |= {"MATLAB file": 150}
-LONG |= {"measurement": 250, "sweep folder": 300, "tuning folder": 200}
+SHORT |= {"sweep folder": 6, "MATLAB file": 3, "fit folder": 25, "tuned folder": 10}
+SHORT |= {"chunks": 8, "program": 25, "outcome": 15, "scheduler": 10}
+LONG = {"study": 1200, "sweep": 1000, "tuning": 900, "fit": 900, "controller": 800, "gains": 300}
+LONG |= {"document": 800, "MATLAB file": 300, "measurement": 900, "sweep folder": 500}
+LONG |= {"tuning folder": 400, "commissioning": 600, "tuned folder": 500, "fit folder": 500}
+LONG |= {"scheduler": 300, "chunks": 500, "program": 300, "outcome": 300}
 
 
-def campaign(kind, count, folder, found):
-    """Faults found."""
-    return [fault for seed in range(count) if (fault := attack(kind, found, folder, seed))]
+def campaign(kind, count, folder, found, first=0):
+    """Faults found from `count` seeds."""
+    seeds = range(first, first + count)
+    return [fault for seed in seeds if (fault := attack(kind, found, folder, seed))]
 
 
 def test_the_long_campaign_covers_all_kinds():
-    assert set(LONG) | {"document"} == set(KINDS) and sum(LONG.values()) >= 3000
+    assert set(LONG) == set(KINDS) and sum(LONG.values()) >= 10_000
     assert sum(SHORT.values()) >= 150
 
 
@@ -71,6 +77,25 @@ def test_the_campaign_notices_tracebacks_and_hangs(tmp_path, monkeypatch):
         assert said in attack("study", found, tmp_path / "originals", 0)
         (tmp_path / "originals" / "study-0").rename(tmp_path / said[:3])
     assert not issubclass(Hang, Exception)
+
+
+def test_the_campaign_notices_another_answer(tmp_path, monkeypatch):
+    found, read = originals("outcome", tmp_path / "originals"), KINDS["outcome"].read
+    answers = iter([{"outcome": 1}, {"outcome": 2}])
+    monkeypatch.setitem(KINDS, "outcome", KINDS["outcome"]._replace(read=lambda _: next(answers)))
+    assert "another answer" in attack("outcome", found, tmp_path, 0)
+    monkeypatch.setitem(KINDS, "outcome", KINDS["outcome"]._replace(read=read))
+    assert attack("outcome", found, tmp_path, 1) == ""
+
+
+def test_a_changed_baseline_is_refused(tmp_path, sweep):
+    """A bit of a number: the file is as readable as before."""
+    out = tmp_path / "out"
+    shutil.copytree(sweep, out)
+    with h5py.File(out / BASELINE, "r+") as file:
+        file["residual_rms"][...] = np.nextafter(file["residual_rms"][()], np.inf)
+    with pytest.raises(StudyError, match="baseline.h5: damaged; remove it and go on with --resume"):
+        read_sweep(out)
 
 
 @pytest.mark.parametrize("kind", ["fifo", "device", "folder", "large"])
@@ -239,6 +264,14 @@ def test_a_lock_that_is_a_pipe_is_not_waited_for(tmp_path):
     refused = pytest.raises(StudyError, match="cannot write there")
     with mutations.time_limit(5), refused, locked_folder(tmp_path, "sweep"):
         pass
+
+
+def test_results_are_printed_in_any_encoding(sweep, monkeypatch):
+    printed = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(printed, encoding="ascii"))
+    main(["show", str(sweep)])
+    sys.stdout.flush()
+    assert rb"\xb5m" in printed.getvalue()
 
 
 def test_results_that_are_no_file_are_no_results(tmp_path, sweep, capsys):

@@ -1,6 +1,7 @@
 """`studies verify`: its table, and that it can fail: deliberate faults in a copy of the code."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -371,6 +372,18 @@ def test_a_damaged_outcome_is_none(checks, capsys):
     call(capsys, "verify")
     (file,) = passport.chosen_folder().glob("passport-*")
     endless = '{"title": "", "passed": Infinity}'
-    for text in ("", "{", "[1]", '{"title": "", "passed": "many"}', endless, "[" * 100_000):
+    changed = file.read_text().replace('"passed": 1', '"passed": 2')
+    for text in (
+        changed,
+        "",
+        "{",
+        "[1]",
+        '{"title": "", "passed": "many"}',
+        endless,
+        "[" * 100_000,
+    ):
         file.write_text(text)
         assert passport.find(paper_study()) is None
+    file.unlink()
+    os.mkfifo(file)
+    assert passport.find(paper_study()) is None

@@ -13,10 +13,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
+
 from jaxmodel.case import Drive
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
-from jaxmodel.table import Parameter, PartError, check_parameters
+from jaxmodel.table import Parameter, PartError, check_parameters, is_real
 
 
 class SliderError(NamedTuple):
@@ -71,6 +73,23 @@ def check_drive(law: DriveLaw) -> None:
     check_parameters(place, law.parameters)
 
 
+def drive_force(
+    law: DriveLaw, drive: Drive, memory: Array | None, error: SliderError, is_smooth: bool
+) -> Array:
+    """Force of a drive [N], arguments as its own.
+
+    Raises:
+        PartError: it is none.
+    """
+    force = law.force(drive, memory, error, is_smooth)
+    wanted = np.shape(error.position)
+    if not is_real(force) or np.shape(force) not in ((), wanted):
+        raise PartError(
+            f"drive {law.name!r}: force returns {force!r}; expected real numbers of shape {wanted}"
+        )
+    return force
+
+
 def resting_drive(law: DriveLaw, like: Array) -> DriveState | None:
     """State of a drive at rest; None if it is not sampled.
 
@@ -98,7 +117,7 @@ def drive_gains(law: DriveLaw, drive: Drive) -> DriveGains:
 
     def slope(position: Array, rate: Array) -> Array:
         def force(e: Array, e_rate: Array) -> Array:
-            return law.force(drive, memory, SliderError(e, e_rate), True)
+            return drive_force(law, drive, memory, SliderError(e, e_rate), True)
 
         change: Array = jax.jvp(force, (zero, zero), (position, rate))[1]
         return change

@@ -5,7 +5,8 @@ like `rrr` and add its `Mechanism` to the list below; from outside the package, 
 `MECHANISMS.add`.
 """
 
-from jaxmodel.mechanisms.contract import Mechanism, check_mechanism
+from jaxmodel.mechanisms.check import check_mechanism
+from jaxmodel.mechanisms.contract import Mechanism
 from jaxmodel.mechanisms.five_bar import FIVE_BAR
 from jaxmodel.mechanisms.prrr import PRRR
 from jaxmodel.mechanisms.rrr import RRR

@@ -16,7 +16,7 @@ import numpy as np
 from jaxmodel.lazy import jnp
 from jaxmodel.mechanisms.carriers import Carrier
 from jaxmodel.parameters import Array
-from jaxmodel.table import Parameter, PartError, check_parameters
+from jaxmodel.table import Parameter
 
 
 class Mechanism(NamedTuple):
@@ -37,21 +37,6 @@ class Mechanism(NamedTuple):
     parameters: tuple[Parameter, ...] = ()
     allowed: str = "a pose within reach"  # of the poses, for messages
     reads: tuple[str, ...] = ()  # fields of `[machine]`, beside those of the platform's inertia
-
-
-def check_mechanism(mechanism: Mechanism) -> None:
-    """Raise PartError if the description of a mechanism is invalid."""
-    place = f"mechanism {mechanism.name!r}"
-    if not callable(mechanism.build):
-        raise PartError(f"{place}: build = {mechanism.build!r}; expected a function")
-    if mechanism.n_pose not in (2, 3) or mechanism.n_links != mechanism.n_pose:
-        raise PartError(
-            f"{place}: n_links = {mechanism.n_links}, n_pose = {mechanism.n_pose}; allowed: 3 and "
-            "3, or 2 and 2"
-        )
-    if len(mechanism.home) != mechanism.n_pose:
-        raise PartError(f"{place}: home = {mechanism.home}; expected {mechanism.n_pose} numbers")
-    check_parameters(place, mechanism.parameters)
 
 
 class Near(NamedTuple):

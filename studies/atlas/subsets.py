@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.laws import LAWS
+from jaxmodel.mechanisms import MECHANISMS
 from studies.engine.preflight import preflight
 from studies.engine.results import read_sweep
 from studies.engine.runs import resolved_study
@@ -48,8 +49,10 @@ def in_order(players: int) -> list[int]:
     ]
 
 
+#: Links of the machines that have an atlas.
+LINKS = 3
 #: The 8 choices of links, in that order.
-CHOICES = in_order(3)
+CHOICES = in_order(LINKS)
 
 
 class Subsets(NamedTuple):
@@ -215,6 +218,9 @@ def long_enough(study: Study, settings: tuple[tuple[float, str], ...]) -> Study:
 
 def _check(study: Study) -> None:
     control, motion = study.control, study.motion
+    if study.n_links != LINKS:
+        able = ", ".join(x.name for x in MECHANISMS.values() if x.n_links == LINKS)
+        raise field_error("machine.kind", study.machine.kind, f"{able}: machines of {LINKS} links")
     if control.modes > MODE_LIMIT:
         raise field_error(
             "control.modes",

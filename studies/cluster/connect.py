@@ -9,6 +9,7 @@ import re
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from ipaddress import ip_address
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeVar
@@ -134,7 +135,7 @@ def connected(workers: Workers, on_progress: Callable[[str], None]) -> Iterator[
     cluster = (
         _local_cluster(workers.local or 0)
         if workers.scheduler is None
-        else _remote_cluster(workers.scheduler)
+        else _remote_cluster(workers.scheduler, on_progress)
     )
     with cluster as client:
         if not client.ncores():
@@ -145,13 +146,19 @@ def connected(workers: Workers, on_progress: Callable[[str], None]) -> Iterator[
 
 
 @contextmanager
-def _remote_cluster(scheduler: str) -> Iterator[Client]:
+def _remote_cluster(scheduler: str, say: Callable[[str], None]) -> Iterator[Client]:
     from distributed import Client
     from distributed.security import Security
 
-    address = scheduler if "://" in scheduler else _written_address(scheduler)
+    address = scheduler if "://" in scheduler else written_address(scheduler)
     if not re.fullmatch(r"(tcp|tls)://[^/]+:\d+", address):
         raise field_error("--scheduler", address, "tcp://HOST:PORT or tls://HOST:PORT")
+    if address.startswith("tcp://") and not _is_here(address):
+        say(
+            f"--scheduler {address}: not encrypted, and whoever reaches that port can run programs "
+            "here and on the workers; use tls:// unless the network is private "
+            "(docs/how-to/cluster.md)"
+        )
     # Dask does not clean up after these errors
     context = Security().get_connection_args("client").get("ssl_context")
     if address.startswith("tls://") and context is None:
@@ -168,7 +175,16 @@ def _remote_cluster(scheduler: str) -> Iterator[Client]:
         yield client
 
 
-def _written_address(file: str) -> str:
+def _is_here(address: str) -> bool:
+    """Whether only this machine can be at an address."""
+    host = address.split("://")[1].rpartition(":")[0].strip("[]")
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:  # a name
+        return host == "localhost"
+
+
+def written_address(file: str) -> str:
     """Address in a scheduler's file."""
     try:
         address = read_json(Path(file))["address"]

@@ -1,6 +1,7 @@
 """From the file to the folder: stage after stage, each done once, or a refusal with reasons.
 
-`request.json` says what was asked for; a stage whose answer is in its folder is not done again.
+`request.json` says what was asked for; a stage whose answer is in its folder is not done again,
+but the answer must be as it was written (`answers.json`).
 """
 
 from __future__ import annotations
@@ -20,9 +21,11 @@ from studies.commission.stages import (
     STAGES,
     Stage,
     certificate_document,
+    check_answer,
     fit_document,
     has_fast_motion,
     is_verified,
+    keep_answer,
     possible_machines,
     tuned_design,
 )
@@ -99,6 +102,7 @@ def _outcome(measured: MeasuredSpec, out: Path, console: Console) -> CommissionF
     for stage in STAGES:
         fault = _run(stage, measured, out, console)
         outcome = _judged(outcome, stage, fault, measured, console)
+        keep_answer(stage, out)
         if outcome.refusals:
             break
     return outcome
@@ -108,6 +112,7 @@ def _run(stage: Stage, measured: MeasuredSpec, out: Path, console: Console) -> s
     """Do a stage unless it is done; what it refuses, "" if nothing."""
     number = f"stage {STAGES.index(stage) + 1} of {len(STAGES)}, {stage.name}"
     if stage.is_done(out):
+        check_answer(stage, out)
         console.print(f"{number}: already computed")
         return ""
     console.print(f"{number}: {stage.text}")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +15,7 @@ from studies.commission.machines import Possible, margin_spread, unknown_to_cont
 from studies.commission.spec import MeasuredSpec, certified_margin, tuning_section
 from studies.engine.design import Design, load_design
 from studies.engine.fast_motion import TellingMotion, find_motion, with_own_motion
+from studies.errors import StudyError
 from studies.export.run import FAILED, export_design
 from studies.export.run import REPORT as VERIFICATION
 from studies.export.targets import TARGETS
@@ -117,6 +120,57 @@ STAGES = (
         make=_export,
     ),
 )
+
+
+#: What the stages have answered, as hashes of their files.
+ANSWERS = "answers.json"
+#: Endings of files that later stages read.
+_READ = (".json", ".h5", ".toml", ".npy")
+
+
+def keep_answer(stage: Stage, out: Path) -> None:
+    """Record the files of a stage, so that a change of them is noticed."""
+    kept = _kept_answers(out) | {stage.name: _hashes(stage, out)}
+    with replacing(out / ANSWERS) as temporary:
+        temporary.write_text(json.dumps(kept, indent=1), encoding="utf-8")
+
+
+def check_answer(stage: Stage, out: Path) -> None:
+    """Check that the files of a stage are those that were recorded.
+
+    Raises:
+        StudyError: one is not.
+    """
+    found = _hashes(stage, out)
+    for name, wanted in _kept_answers(out).get(stage.name, {}).items():
+        if found.get(name) != wanted:
+            raise StudyError(
+                f"{out / name}: damaged, or changed since it was written; put the right one back, "
+                "or name a new folder"
+            )
+
+
+def _kept_answers(out: Path) -> dict[str, dict[str, str]]:
+    path = out / ANSWERS
+    if not path.exists():
+        return {}
+    try:
+        kept = read_json(path)
+        return {name: dict(kept[name]) for name in kept}
+    except (OSError, ValueError, TypeError) as error:
+        raise StudyError(f"{path}: damaged ({error}); name a new folder") from None
+
+
+def _hashes(stage: Stage, out: Path) -> dict[str, str]:
+    """Of the files of a stage, by their names in the folder."""
+    files = {out / name for name in stage.last}
+    if (out / stage.name).is_dir():
+        files |= {x for x in (out / stage.name).iterdir() if x.suffix in _READ}
+    return {
+        str(file.relative_to(out)): sha256(file.read_bytes()).hexdigest()
+        for file in sorted(files)
+        if file.is_file()
+    }
 
 
 def fit_document(out: Path) -> dict[str, Any]:

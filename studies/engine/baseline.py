@@ -11,7 +11,13 @@ from jaxmodel import status
 from studies.engine.columns import axis_variables
 from studies.engine.folder import BASELINE
 from studies.engine.frame import frame_of
-from studies.engine.results import baseline_id, controlled, read_baseline
+from studies.engine.results import (
+    DIGEST,
+    baseline_digest,
+    baseline_id,
+    controlled,
+    read_baseline,
+)
 from studies.engine.run_data import metric_variables, run_attributes
 from studies.engine.runs import run_uncontrolled
 from studies.engine.stored import kept_metrics
@@ -54,6 +60,7 @@ def keep_baseline(
         variables |= {name: metrics[name] for name in kept_metrics(spec)}
     variables |= axis_variables(run.study, axis_sizes(variables))
     attributes = run_attributes(run.study) | {"case_id": baseline_id(spec)}
+    attributes[DIGEST] = baseline_digest(variables)
     write_store(folder / BASELINE, variables, attributes)
 
 

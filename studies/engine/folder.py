@@ -220,12 +220,17 @@ def locked_folder(path: Path, what: str) -> Iterator[None]:
     with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             raise StudyError(f"--out {path}: another process is running a {what} there") from None
+        except OSError as error:
+            raise StudyError(
+                f"--out {path}: cannot be locked against other processes ({error.strerror}); name "
+                "a folder on another file system"
+            ) from None
         try:
             yield
         except StudyError:
-            if set(path.iterdir()) - before == {path / LOCK}:
+            if path.is_dir() and set(path.iterdir()) - before == {path / LOCK}:
                 (path / LOCK).unlink()
                 with suppress(OSError):  # somebody else has used one meanwhile
                     for folder in created:

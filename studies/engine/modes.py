@@ -93,7 +93,7 @@ def _kind(link_share: np.ndarray, drive_share: float, turn_share: float) -> Mode
 
 def modes_study(
     study: Study | None = None,
-    pose: tuple[float, float, float] | None = None,
+    pose: tuple[float, ...] | None = None,
     kp: float | None = None,
     kd: float | None = None,
     damping: float | None = None,

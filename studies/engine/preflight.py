@@ -331,6 +331,9 @@ def step_counts(needed: Any) -> np.ndarray:
 
 def _drive_substeps(study: Study, rate: float) -> int:
     """Plant steps per sample that the drives and their friction need, or as given."""
+    if not np.isfinite(rate):
+        allowed = "a drive whose force has finite slopes at rest"
+        raise field_error("drive.kind", study.drive.kind, allowed)
     needed = max(int(np.ceil(rate / study.electronics.sample_rate_hz / STIFFNESS_LIMIT)), 1)
     written, drive = study.run.substeps, study.drive
     if needed <= (written or SUBSTEP_LIMIT):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -167,7 +169,23 @@ def read_baseline(folder: Path, spec: SweepSpec) -> dict[str, Variable]:
             or stored.data.dtype.kind not in "if"
         ):
             raise StudyError(f"{path}: damaged ({name}); remove it and go on with --resume")
+    if attributes.get(DIGEST) not in (None, baseline_digest(variables)):  # None: an older one
+        raise StudyError(f"{path}: damaged; remove it and go on with --resume")
     return variables if attributes.get("case_id") == baseline_id(spec) else {}
+
+
+#: Attribute of the baseline's file.
+DIGEST = "digest"
+
+
+def baseline_digest(variables: Mapping[str, Variable]) -> str:
+    """Hash of a baseline's numbers."""
+    digest = sha256()
+    for name in sorted(variables):
+        if name in BASELINE_DIMS or name in METRICS:
+            data = np.asarray(variables[name].data)
+            digest.update(f"{name} {data.dtype} {data.shape} ".encode() + data.tobytes())
+    return digest.hexdigest()
 
 
 def baseline_id(spec: SweepSpec) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,7 +29,7 @@ from studies.export.in_the_loop import LoopRun, law_of, run_in_the_loop
 from studies.export.job import check_loop
 from studies.export.run import checked_bits, checked_board
 from studies.export.verify import load_code, reference_run
-from studies.publish import announce, check_folder, publish, shown
+from studies.publish import announce, check_folder, publish, shown, working_folder
 from studies.show.document import json_text
 from studies.show.pages import page
 from studies.study.margin import margin_text
@@ -244,9 +243,9 @@ def _emulation(
     source: Source, board: Board, is_fixed: bool
 ) -> Iterator[tuple[Built, EmulatedCode]]:
     """The code, built for a processor and running on it."""
-    with tempfile.TemporaryDirectory() as folder:
-        write_files(project_files(source, NAME, board, is_fixed), Path(folder))
-        built = build(Path(folder), NAME, board, is_fixed)
+    with working_folder() as folder:
+        write_files(project_files(source, NAME, board, is_fixed), folder)
+        built = build(folder, NAME, board, is_fixed)
         with emulated(built.image, board) as processor:
             yield built, processor
 

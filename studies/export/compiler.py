@@ -7,16 +7,15 @@ import os
 import shlex
 import shutil
 import subprocess
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from studies.errors import StudyError
 from studies.export.c_text import Source
+from studies.publish import working_folder
 
 #: Flags with which exported code must compile without warnings.
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
@@ -146,8 +145,8 @@ def library(source: Source, name: str, compiler: list[str], real: type) -> Itera
     Raises:
         StudyError: the compiler rejects the code, or does not work.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        header, code, built = (Path(folder) / f"{name}{end}" for end in (".h", ".c", ".so"))
+    with working_folder() as folder:
+        header, code, built = (folder / f"{name}{end}" for end in (".h", ".c", ".so"))
         header.write_text(source.header, encoding="utf-8")
         code.write_text(source.code, encoding="utf-8")
         single = [f"-D{name.upper()}_REAL=float"] if real is np.float32 else []

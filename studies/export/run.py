@@ -16,7 +16,7 @@ from studies.export.compiler import NO_COMPILER, find_compiler
 from studies.export.document import study_hash
 from studies.export.firmware.boards import BOARDS, Board
 from studies.export.firmware.build import check_tools
-from studies.export.job import Job
+from studies.export.job import ExportResult, Job
 from studies.export.report import report
 from studies.export.targets import TARGETS
 from studies.export.verify import Verification
@@ -108,6 +108,11 @@ def export_design(
         board=board,
     )
     result = TARGETS[target].make(job)
+    if not _is_result(result):
+        wanted = "an ExportResult with the text of each file"
+        raise StudyError(
+            f"--target {target}: it returns {type(result).__name__}; expected {wanted}"
+        )
     for file in result.files:
         if Path(file).name != file or file.startswith("."):
             raise StudyError(f"--target {target}: it makes {file!r}; expected a plain file name")
@@ -124,6 +129,15 @@ def export_design(
     for file in texts:
         console.print(f"written: {out / file}", soft_wrap=True)
     return Exported(exported, target, tuple(out / file for file in texts), verified)
+
+
+def _is_result(found: object) -> bool:
+    """Whether a target, which may be a user's, has made texts of files."""
+    return (
+        isinstance(found, ExportResult)
+        and isinstance(found.files, dict)
+        and all(isinstance(text, str) for pair in found.files.items() for text in pair)
+    )
 
 
 def _check_arguments(target: str, name: str, dac_bits: int | None) -> None:

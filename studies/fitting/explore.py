@@ -40,7 +40,7 @@ def explore_fit(folder: Path, on_progress: Callable[[int, int], None]) -> Explor
         rise = np.concatenate([data["optimum_rise"].data, np.full(len(machines), np.nan)])
         names = [str(name) for name in data["number"].data]
         study = parse_study(parse_json(attributes["study"]))
-    except (KeyError, ValueError, TypeError) as error:
+    except (LookupError, ValueError, TypeError, AttributeError) as error:
         raise StudyError(f"{folder / FIT}: damaged ({error})") from None
     parameters = [
         Column(name, "", values[:, k], is_parameter=True, is_log=is_wide(values[:, k]))

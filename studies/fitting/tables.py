@@ -11,11 +11,11 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-import scipy
 
 from studies.errors import StudyError, field_error, nearest, shown
 from studies.reading import LARGEST as LARGEST_FILE
 from studies.reading import open_hdf5, open_regular, read_bytes, read_text
+from studies.study.matlab import read_mat
 
 #: Endings of the formats.
 FORMATS = (".csv", ".txt", ".h5", ".hdf5", ".mat", ".uff", ".unv")
@@ -164,19 +164,9 @@ def _from_matlab(where: Path, struct: str) -> dict[str, np.ndarray]:
     if h5py.is_hdf5(where):
         return _from_matlab_hdf5(where, struct)
     _check_unpacked(read_bytes(where))
-    try:
-        held = scipy.io.loadmat(where, squeeze_me=True, struct_as_record=True)
-    except Exception as error:  # of any kind, for a damaged file
-        raise ValueError(str(error) or "damaged") from error
-    if struct:
-        record = held.get(struct)
-        if not isinstance(record, np.ndarray) or record.dtype.names is None or record.size != 1:
-            raise ValueError(f"has no struct {struct}")
-        held = {name: np.squeeze(record[()][name]) for name in record.dtype.names}
+    vectors = {name: np.squeeze(x) for name, x in read_mat(where, struct, _UNPACKED).items()}
     return {
-        name: _numbers(x)
-        for name, x in held.items()
-        if isinstance(x, np.ndarray) and x.ndim == 1 and x.dtype.kind in "iufc"
+        name: _numbers(x) for name, x in vectors.items() if x.ndim == 1 and x.dtype.kind in "iufc"
     }
 
 

@@ -21,5 +21,6 @@ def find_card(name: str) -> PaperCard:
         StudyError: there is none.
     """
     if name not in CARDS:
-        raise field_error("NAME", name, ", ".join(CARDS), hint=nearest(name, CARDS))
+        begun = next((card for card in CARDS if name and card.startswith(name.lower())), "")
+        raise field_error("NAME", name, ", ".join(CARDS), hint=begun or nearest(name, CARDS))
     return CARDS[name]

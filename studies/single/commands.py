@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from studies.config import start
+from studies.errors import field_error
 from studies.publish import announce
 from studies.show.document import AsJson, print_document
 
@@ -82,8 +83,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             ),
         ] = None,
         pose: Annotated[
-            tuple[float, float, float] | None,
-            typer.Option(help="x [m] y [m] phi [rad]; default: the first pose"),
+            str | None,
+            typer.Option(
+                help="x [m], y [m] and, of a rigid body, phi [rad], with commas between them, as "
+                "in 0,0.01,0.5236; default: the first pose"
+            ),
         ] = None,
         kp: Annotated[
             float | None, typer.Option(help="drive stiffness [N/m], 0 = free drives")
@@ -105,7 +109,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
         result = machine_modes(
             None if study is None else load_study(study),
-            pose=pose,
+            pose=None if pose is None else _numbers("--pose", pose),
             kp=kp,
             kd=kd,
             damping=damping,
@@ -147,6 +151,14 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             f"sensors, {1e6 * found.sample_time:g} µs a sample; written: {out}",
             soft_wrap=True,
         )
+
+
+def _numbers(option: str, written: str) -> tuple[float, ...]:
+    """Numbers with commas between them."""
+    try:
+        return tuple(map(float, written.split(",")))
+    except ValueError:
+        raise field_error(option, written, "numbers with commas between them") from None
 
 
 def _print_run(run: Run, twin: Run | None, console: Console) -> None:

@@ -10,6 +10,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from hashlib import blake2b
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from studies.space.spec import SweepSpec
 from studies.study.consistency import SAMPLE_LIMIT
 from studies.study.fields import Columns, Fields, padded
 from studies.study.paths import (
+    Parts,
     as_list,
     is_each_link,
     known_field,
@@ -144,6 +146,7 @@ def build_table(spec: SweepSpec, rows: np.ndarray | None = None) -> CaseTable:
     _check_samples(spec.study, columns)
     _check_moves(spec.study, columns)
     check_varied(spec.data, spec.study, columns)
+    _check_read(spec.study, columns)
     if np.any(columns.get(DELAY, np.zeros(1)).astype(str) == AUTO):
         raise field_error(DELAY, AUTO, "numbers in an axis; without the axis, 'auto' holds", "s")
     n = len(rows)
@@ -210,6 +213,16 @@ def _check_shapes(columns: Columns) -> None:
             kinds = {isinstance(value, tuple) for value in columns[name]}
             if len(kinds) > 1:
                 raise StudyError(f"{name}: numbers and lists mixed; use one of them")
+
+
+def _check_read(study: Study, columns: Columns) -> None:
+    """Reject own fields of a law, drive or mechanism that no case selects."""
+    selectors = ("control.law", "drive.kind", "machine.kind")
+    chosen = product(*(np.unique(values(study, columns, name)) for name in selectors))
+    every = [Parts(*names) for names in chosen]
+    for name in columns:
+        if not any(parts.owns(name) for parts in every):
+            raise StudyError(f"{name}: varies, but no case selects the part whose field it is")
 
 
 def _check_samples(study: Study, columns: Columns) -> None:

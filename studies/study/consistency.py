@@ -17,7 +17,7 @@ from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.mechanisms.contract import Mechanism
 from jaxmodel.piezo import VACUUM_PERMITTIVITY
 from jaxmodel.table import Table
-from studies.errors import field_error, nearest, shown
+from studies.errors import StudyError, field_error, nearest, shown
 from studies.study.state_space import check_system
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def check_consistency(study: Study) -> None:
     check_system(study, n_patches)
     _check_lists(study)
     check_own_fields(study)
-    _check_mechanism(study)
+    check_mechanism(study)
     _check_basis(study)
     _check_stations(study)
     _check_sampling(study)
@@ -92,8 +92,12 @@ def check_own_fields(study: Study) -> None:
     _check_own_fields("machine.kinds", study.machine.kinds, MECHANISMS)
 
 
-def _check_mechanism(study: Study) -> None:
-    """Reject fields that the study's mechanism does not read."""
+def check_mechanism(study: Study) -> None:
+    """Check that the study's mechanism reads the fields that are not at their defaults.
+
+    Raises:
+        StudyError: one that it does not read.
+    """
     mechanism, machine = study.mechanism, study.machine
     solid = {"platform_inertia"} if mechanism.n_pose == 3 else set()
     read = {"kind", "kinds", "platform_mass", *solid, *mechanism.reads}
@@ -102,8 +106,10 @@ def _check_mechanism(study: Study) -> None:
         if isinstance(default, tuple):
             default = default[: mechanism.n_links]
         if leaf not in read and value != default:
-            without = f"not given: machine.kind = {mechanism.name!r} has no such part"
-            raise field_error(f"machine.{leaf}", value, without)
+            raise StudyError(
+                f"machine.{leaf} = {shown(value)}: machine.kind = {mechanism.name!r} has no such "
+                "part; leave it out"
+            )
     if not solid:
         for leaf in ("inertia", "offset"):
             if np.any(getattr(study.load, leaf)):
@@ -172,11 +178,10 @@ def _check_damping(study: Study) -> None:
     for leaf in ("pole_decay", "pole_frequency_hz", "velocity_gain", "position_gain"):
         value = getattr(control, leaf)
         if value != type(control).model_fields[leaf].default:
-            ratios = shown(control.damping)
-            allowed = (
-                f"not given where control.damping = {ratios} decides the gains: change that instead"
+            raise StudyError(
+                f"control.{leaf} = {shown(value)}: control.damping = {shown(control.damping)} "
+                "decides the gains; leave one of them out"
             )
-            raise field_error(f"control.{leaf}", value, allowed)
     most = 1 - _largest(study.link.damping_ratio)
     if _largest(control.damping) >= most:
         allowed = f"below {most:g}, 1 less link.damping_ratio"

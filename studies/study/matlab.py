@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from studies.reading import parse_npz, read_bytes
+from studies.reading import LARGEST, parse_npz, read_bytes
 
 #: The program that reads; not imported, since it needs SciPy.
 READER = Path(__file__).with_name("unpack_mat.py")
@@ -17,19 +17,24 @@ READER = Path(__file__).with_name("unpack_mat.py")
 PATIENCE = 60
 
 
-def read_mat(path: Path) -> dict[str, np.ndarray]:
+def read_mat(path: Path, struct: str = "", most: int = LARGEST) -> dict[str, np.ndarray]:
     """Numbers and texts of a MAT file by name; matrices keep their two dimensions.
+
+    Args:
+        path: the file.
+        struct: whose fields are meant, "" for the variables themselves.
+        most: bytes that they may be together.
 
     Raises:
         OSError: not there, not readable, no regular file, too large.
-        ValueError: damaged, or of MATLAB 7.3.
+        ValueError: damaged, of MATLAB 7.3, or no such struct.
 
     Example:
         >>> read_mat(Path("controller.mat"))["A"].shape  # doctest: +SKIP
         (4, 4)
     """
     content = read_bytes(path)
-    command = [sys.executable, "-I", str(READER)]
+    command = [sys.executable, "-I", str(READER), *([struct] if struct else [])]
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     try:
         done = subprocess.run(
@@ -40,4 +45,4 @@ def read_mat(path: Path) -> dict[str, np.ndarray]:
     if done.returncode:
         lines = done.stderr.decode(errors="replace").splitlines()
         raise ValueError(lines[-1] if done.returncode == 1 and lines else "damaged")
-    return parse_npz(done.stdout)
+    return {name[1:]: x for name, x in parse_npz(done.stdout, most).items()}

@@ -21,7 +21,7 @@ from jaxmodel.mechanisms.contract import Mechanism
 from jaxmodel.mechanisms.prrr import PRRR
 from jaxmodel.table import Parameter
 from studies.errors import StudyError, field_error, nearest, shown
-from studies.study.consistency import check_consistency, check_own_fields
+from studies.study.consistency import check_consistency, check_mechanism, check_own_fields
 from studies.study.explain import choices_of, unit_of
 from studies.study.sizes import alternatives, depth, has_one_a_link
 from studies.study.spec import (
@@ -259,8 +259,11 @@ def checked_value(study: Study, name: str, value: Any, path: str) -> Any:
     data = set_value(study, name, as_tuples(value))
     try:
         changed = validate(data)
-        is_judged = name.startswith(JUDGED_BY_STATUS)
-        (check_own_fields if is_judged else check_consistency)(changed)
+        if name.startswith(JUDGED_BY_STATUS):
+            check_own_fields(changed)
+            check_mechanism(changed)
+        else:
+            check_consistency(changed)
     except ValidationError as error:
         raise StudyError(f"{path}: {explained(error, data)}") from None
     except StudyError as error:

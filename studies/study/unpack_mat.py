@@ -1,5 +1,7 @@
 """Program that turns a MAT file on standard input into an NPZ file on standard output.
 
+Its argument names a struct whose fields are meant; every name in the NPZ file begins with _.
+
 Damaged files can crash SciPy's reader, compiled code, so `studies.study.matlab` runs it here.
 """
 
@@ -26,13 +28,24 @@ def numbers_and_texts(variables: dict[str, Any]) -> dict[str, np.ndarray]:
     return {name: x for name, x in (arrays | texts).items() if x.dtype.kind in "biufcU"}
 
 
+def fields_of(variables: dict[str, Any], struct: str) -> dict[str, Any]:
+    """Fields of one of them."""
+    record = variables.get(struct)
+    if not isinstance(record, np.ndarray) or record.dtype.names is None or record.size != 1:
+        raise ValueError(f"has no struct {struct}")
+    return {name: record.ravel()[0][name] for name in record.dtype.names}
+
+
 def main() -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     try:
-        arrays = numbers_and_texts(scipy.io.loadmat(BytesIO(sys.stdin.buffer.read())))
-        packed = BytesIO()
-        np.savez(packed, allow_pickle=False, **arrays)
+        variables, packed = scipy.io.loadmat(BytesIO(sys.stdin.buffer.read())), BytesIO()
+        if sys.argv[1:]:
+            variables = fields_of(variables, sys.argv[1])
+        arrays = numbers_and_texts(variables)
+        # no name is an argument's
+        np.savez(packed, allow_pickle=False, **{f"_{name}": x for name, x in arrays.items()})
     except NotImplementedError:
         sys.exit("a file of MATLAB 7.3; save it with -v7")
     except Exception as error:  # of any kind, for a damaged file

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxmodel.case import Drive
 from jaxmodel.drives import DRIVES
-from jaxmodel.drives.contract import SliderError
+from jaxmodel.drives.contract import SliderError, drive_force
 from studies.errors import StudyError, field_error
 from studies.study.geometry import far_joints, machine_geometry
 from studies.study.spec import AUTO, Study
@@ -188,7 +188,7 @@ def _drive_slopes(study: Study) -> np.ndarray:
     for k in range(3 if law.update else 2):
         e, rate, memory = (_SMALL * np.ones(study.n_links) if k == j else zero for j in range(3))
         error = SliderError(e, rate)
-        force = np.asarray(law.force(drive, memory if law.update else None, error, True))
+        force = np.asarray(drive_force(law, drive, memory if law.update else None, error, True))
         slopes[:, 0, k] = force / _SMALL
         if law.update:
             after = np.asarray(law.update(drive, memory, error, force, np.asarray(period)))

@@ -57,7 +57,7 @@ def explore_tuning(folder: Path, on_progress: Callable[[int, int], None]) -> Exp
             },
             notes=_is_stale(folder, attributes),
         )
-    except (KeyError, ValueError, TypeError) as error:
+    except (LookupError, ValueError, TypeError, AttributeError) as error:
         raise StudyError(f"{folder / RESULTS}: damaged ({error})") from None
     families = {family.name: family for family in spec.families}
 

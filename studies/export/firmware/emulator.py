@@ -11,7 +11,6 @@ import os
 import select
 import struct
 import subprocess
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,6 +23,7 @@ from studies.errors import StudyError
 from studies.export.firmware.boards import Board
 from studies.export.firmware.build import EMULATOR
 from studies.export.firmware.project import BLOCK, CLOCK
+from studies.publish import working_folder
 
 #: An instruction takes 2^SHIFT ns of the emulated time: several ticks of the timer.
 SHIFT = 7
@@ -154,8 +154,8 @@ def emulated(image: Path, board: Board, traced_to: Path | None = None) -> Iterat
     Raises:
         StudyError: it does not run, or stops.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        names = [str(Path(folder) / name) for name in ("to_target", "from_target")]
+    with working_folder() as folder:
+        names = [str(folder / name) for name in ("to_target", "from_target")]
         for name in names:
             os.mkfifo(name)
         # both ends, so that opening does not wait for the program

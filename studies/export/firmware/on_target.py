@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +29,7 @@ from studies.export.verify import (
     path_counts,
     reference_path,
 )
+from studies.publish import working_folder
 from studies.study.labels import describe
 
 #: Episodes of random input with faults, each after a reset.
@@ -90,10 +89,10 @@ def verify_on_target(at: Comparison) -> OnTarget:
     Raises:
         StudyError: Arm's compiler rejects the code.
     """
-    with tempfile.TemporaryDirectory() as folder:
+    with working_folder() as folder:
         files = project_files(at.source, at.name, at.board, at.is_fixed)
-        write_files(files, Path(folder))
-        built = build(Path(folder), at.name, at.board, at.is_fixed)
+        write_files(files, folder)
+        built = build(folder, at.name, at.board, at.is_fixed)
         found = OnTarget(
             board=at.board,
             files=files,

@@ -1,0 +1,64 @@
+"""File systems that fail: without locks, without room, or gone in mid-run."""
+
+import errno
+import fcntl
+import os
+import shutil
+import tempfile
+
+import pytest
+
+from studies.engine import sweep as sweeps
+from studies.engine.folder import LOCK, locked_folder
+from studies.engine.sweep import run_sweep
+from studies.errors import StudyError
+from studies.publish import working_folder
+from tests.sweeps import small_spec
+
+
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS])
+def test_a_file_system_without_locks_is_refused_in_words(tmp_path, monkeypatch, code):
+    def flock(*_):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    refused = pytest.raises(StudyError, match="cannot be locked .*; name a folder on another file")
+    with refused, locked_folder(tmp_path / "out", "sweep"):
+        pass
+
+
+def test_a_folder_in_use_is_another_matter(tmp_path):
+    refused = pytest.raises(StudyError, match="another process is running a sweep there")
+    with locked_folder(tmp_path, "sweep"), refused, locked_folder(tmp_path, "sweep"):
+        pass
+    assert (tmp_path / LOCK).exists()
+
+
+def test_a_folder_removed_in_mid_run_ends_in_a_message(tmp_path, monkeypatch):
+    out, keep = tmp_path / "out", sweeps.keep_baseline
+
+    def remove(*arguments):
+        shutil.rmtree(out)
+        keep(*arguments)
+
+    monkeypatch.setattr(sweeps, "keep_baseline", remove)
+    with pytest.raises(StudyError, match="out/baseline.h5.*cannot write"):
+        run_sweep(small_spec({"axes": {"gain": [0.1, 0.5]}}), out, is_quiet=True)
+    assert not out.exists()
+
+
+def test_without_room_for_temporary_files_a_message_says_what_to_do(monkeypatch):
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    with pytest.raises(StudyError, match="No space left .*TMPDIR"), working_folder() as folder:
+        raise full
+    assert not folder.exists()
+    with pytest.raises(OSError, match="is not this one's"), working_folder():
+        raise OSError(errno.ENOENT, "is not this one's")
+
+    def make():
+        raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found")
+
+    monkeypatch.setattr(tempfile, "TemporaryDirectory", make)
+    refused = pytest.raises(StudyError, match="temporary files: cannot write .*TMPDIR")
+    with refused, working_folder():
+        pass
