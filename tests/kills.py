@@ -201,9 +201,12 @@ class Campaign:
 
     def begin(self, command, place, step=0, is_group=False):
         """Start a command; step: the change of a file before which it dies, 0: none."""
+        scratch = Path(f"{place.parent}.tmp")
+        scratch.mkdir(exist_ok=True)
         environment = os.environ | {
             "PYTHONPATH": str(Path(studies.__file__).parents[1]),
-            "KILL_PLACE": str(place.parent),
+            "TMPDIR": str(scratch),
+            "KILL_PLACE": f"{place.parent}/",
             "KILL_STEP": str(step),
             "KILL_COUNT": f"{place.parent}.count",
         }
@@ -319,7 +322,7 @@ def half_done(place, whole):
 
 def outlived(place):
     """Processes of a killed command that do not end by themselves, and are ended here."""
-    mark, deadline = str(place.parent), time.monotonic() + GRACE
+    mark, deadline = f"{place.parent}/", time.monotonic() + GRACE
     while found := [x for x in psutil.process_iter() if mark == place_of(x)]:
         if time.monotonic() > deadline:
             lines = [" ".join(process.cmdline())[:200] for process in found]
