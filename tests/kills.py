@@ -477,26 +477,32 @@ class Cluster:
 
     def kill_workers(self, count):
         """Kill workers while a sweep runs, which ends whole."""
-        command = self._command("worker", "longer", "60")
-        self._strike_workers(command, signal.SIGKILL, count)
-
-    def freeze_workers(self, count):
-        """Freeze workers, whose work is done elsewhere."""
-        command = self._command("frozen worker", "longer", "15")
-        self._strike_workers(command, signal.SIGSTOP, count)
-
-    def _strike_workers(self, command, number, count):
-        done = 0
+        command, done = self._command("worker", "longer", "60"), 0
         while done < count:
             place = self._campaign.fresh(command)
-            process, struck = self._campaign.begin(command, place), []
+            process, hits = self._campaign.begin(command, place), 0
             for _ in range(min(2, count - done)):
-                struck += self._struck(process, number)
-            self._end(command, process, place, len(struck))
-            done += len(struck)
-            for pid in struck:  # those that had nothing to do
+                hits += len(self._struck(process, signal.SIGKILL))
+            self._end(command, process, place, hits)
+            done += hits
+
+    def freeze_worker(self, count):
+        """Freeze a worker, whose work is done elsewhere; later clients are told that it hangs."""
+        command, done = self._command("frozen worker", "longer", "15"), 0
+        while done < count:
+            place = self._campaign.fresh(command)
+            process = self._campaign.begin(command, place)
+            struck = self._struck(process, signal.SIGSTOP)
+            code = process.wait(timeout=LIMIT)
+            for pid in struck:  # one that had nothing to do
                 with suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGCONT)
+            if code and "restart workers that hang" not in said(place):
+                self._fault(command, place, code)
+            if code:
+                process = self._campaign.begin(command, place)
+            self._end(command, process, place, len(struck))
+            done += len(struck)
 
     def _struck(self, process, number):
         """Send a worker a signal at a random moment of a process; its number, if it still runs."""
@@ -571,7 +577,7 @@ class Cluster:
 ON_A_CLUSTER = {
     "client": Cluster.kill_client,
     "worker": Cluster.kill_workers,
-    "frozen worker": Cluster.freeze_workers,
+    "frozen worker": Cluster.freeze_worker,
     "scheduler": Cluster.kill_scheduler,
     "poisoned chunk": Cluster.poison,
     "two at once": Cluster.kill_of_two,

@@ -147,6 +147,20 @@ def test_other_versions_are_refused(cluster, tmp_path):
         told(cluster, tmp_path / "late")  # a worker that came after the others were compared
 
 
+def test_a_frozen_worker_does_not_hold_up_what_connects(cluster, monkeypatch):
+    monkeypatch.setattr(connect, "ANSWER_TIME", 2)
+    frozen = cluster.pids()[0]
+    os.kill(frozen, signal.SIGSTOP)
+    try:
+        with (
+            pytest.raises(StudyError, match="not told its versions within 2 s: restart workers"),
+            connected(Workers(str(cluster.scheduler), None, 60.0), print),
+        ):
+            pass
+    finally:
+        os.kill(frozen, signal.SIGCONT)
+
+
 @pytest.mark.long
 def test_a_tuning_has_the_same_slopes(cluster):
     spec = tuning(GAIN, starts=3)
