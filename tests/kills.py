@@ -63,7 +63,7 @@ atexit.register(tell)
 main()
 """
 #: Longest that a command may take, and that what it has started may outlive it [s].
-LIMIT, GRACE = 400, 10
+LIMIT, GRACE = 900, 10
 #: Names of what only serves to go on, and of what a file says of one call.
 WORKING = {"sweep.json", "tune.json", "request.json", "progress.npz", "chunks", "cache"}
 OF_ONE_CALL = {"results", "git", "run_time", "compile_time"}
@@ -468,6 +468,10 @@ class Cluster:
         for _ in range(2):
             self._machines.add_worker()
 
+    def measure(self):
+        """Run a sweep without kills, which also says how long one takes."""
+        self._span = self._whole().duration
+
     def stop(self):
         """End all its processes."""
         self._machines.stop()
@@ -515,8 +519,10 @@ class Cluster:
 
     def _wait(self, process):
         """Wait until a random moment of a sweep."""
+        start = time.monotonic()
         with suppress(subprocess.TimeoutExpired):
-            process.wait(timeout=self._rng.random() * self._whole().duration)
+            process.wait(timeout=self._rng.random() * self._span)
+            self._span = min(self._span, time.monotonic() - start)  # all is compiled by now
 
     def kill_scheduler(self, count):
         """Kill the scheduler: the client says so, and goes on with the next one."""
@@ -599,6 +605,7 @@ def run_campaign(folder, seed, counts, tell=lambda kind, tally: None):
     if on_cluster:
         cluster = Cluster(campaign)
         try:
+            cluster.measure()
             for kind, count in on_cluster.items():
                 ON_A_CLUSTER[kind](cluster, count)
                 tell(kind, campaign.tallies[kind])

@@ -45,7 +45,7 @@ def check(folder, seed, counts):
 
 
 def test_a_killed_command_is_run_again(tmp_path):
-    check(tmp_path, 0, {"extension": 2, "plant": 2})
+    check(tmp_path, 0, {"sweep": 1, "plant": 1})
 
 
 @pytest.mark.long
