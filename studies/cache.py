@@ -26,7 +26,7 @@ KINDS = {
     "kernel": "machine code of kernels",
     "passport": "outcomes of `studies verify`",
 }
-_OWN = re.compile(r"\.?(program|data|kernel|passport)-[0-9a-f]{64}(\.[0-9a-f]{8}\.tmp)?")
+_OWN = re.compile(r"\.?(program|data|kernel|passport)-[0-9a-f]{64}(\.(\d+-)?[0-9a-f]{8}\.tmp)?")
 _XLA = re.compile(r"\w+-[0-9a-f]{64}-(cache|atime)")
 
 

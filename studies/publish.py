@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
+import glob
 import os
+import re
 import secrets
 import shutil
 import tempfile
@@ -23,6 +25,10 @@ REPORT = "report.html"
 EXPLORER = "explorer.html"
 #: Name prefix of the folders in which files are prepared.
 _STAGED = ".unfinished-"
+#: End of the name under which a file is written: the process, and what tells its files apart.
+_TEMPORARY = re.compile(r"(\d+)-[0-9a-f]{8}\.tmp")
+#: What says that a folder is whole moves there last: its page, then its document.
+_LAST = (".html", ".json")
 
 
 def check_folder(out: str | Path) -> None:
@@ -63,12 +69,17 @@ def check_target(path: str | Path) -> None:
 def replacing(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path that becomes `path` on success, and is removed on any failure.
 
-    Write errors are raised as StudyError.
+    Those that killed processes left are removed. Write errors are raised as StudyError.
     """
     check_target(path)
     target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    start = f".{target.name}."
+    temporary = target.with_name(f"{start}{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
+        for left in target.parent.glob(f"{glob.escape(start)}*.tmp"):
+            owner = _TEMPORARY.fullmatch(left.name.removeprefix(start))
+            if owner and not _is_alive(owner[1]):
+                left.unlink(missing_ok=True)
         yield temporary
         with open(temporary, "rb+") as file:
             os.fsync(file.fileno())
@@ -84,7 +95,8 @@ def publish(out: str | Path, stale: Iterable[str] = ()) -> Iterator[Path]:
     """Yield a folder whose files move to `out` at the end; on a failure, none does.
 
     The folder is prepared inside `out`, which is created if missing. Files of the same names are
-    replaced, others are left alone. What a killed process left unfinished is removed.
+    replaced, others are left alone. What a killed process left unfinished is removed. Page and
+    document move last, and earlier ones go first: where they are, all files are of one result.
 
     Args:
         out: where the files appear.
@@ -102,13 +114,16 @@ def publish(out: str | Path, stale: Iterable[str] = ()) -> Iterator[Path]:
                 shutil.rmtree(left, ignore_errors=True)
         with tempfile.TemporaryDirectory(dir=out, prefix=f"{_STAGED}{os.getpid()}-") as folder:
             yield Path(folder)
-            names = sorted(os.listdir(folder))
+            names = sorted(os.listdir(folder), key=_place)
             for name in names:
                 check_target(out / name)
+            for name in sorted(set(stale) - set(names), key=_place, reverse=True):
+                (out / name).unlink(missing_ok=True)
+            for name in reversed(names if len(names) > 1 else []):
+                if Path(name).suffix in _LAST:
+                    Path(os.path.realpath(out / name)).unlink(missing_ok=True)
             for name in names:
                 os.replace(Path(folder) / name, os.path.realpath(out / name))
-        for name in set(stale) - set(names):
-            (out / name).unlink(missing_ok=True)
     except OSError as error:
         raise StudyError(f"--out {out}: cannot write there ({error.strerror or error})") from error
     finally:
@@ -142,6 +157,12 @@ def working_folder() -> Iterator[Path]:
 
 def _no_room(where: str, error: OSError) -> str:
     return f"{where}: cannot write ({error.strerror}); name a folder with room in TMPDIR"
+
+
+def _place(name: str) -> tuple[int, str]:
+    """Sorts names of files in the order in which they move."""
+    suffix = Path(name).suffix
+    return (1 + _LAST.index(suffix) if suffix in _LAST else 0), name
 
 
 def announce(console: Console, report: Path, more: str = "") -> None:

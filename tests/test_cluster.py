@@ -1,7 +1,6 @@
 """Sweeps and tunings on a real scheduler and two real workers: the same numbers, whatever dies."""
 
 import os
-import random
 import signal
 import sys
 import threading
@@ -167,6 +166,20 @@ def test_other_versions_are_refused(cluster, tmp_path):
         told(cluster, tmp_path / "late")  # a worker that came after the others were compared
 
 
+def test_a_frozen_worker_does_not_hold_up_what_connects(cluster, monkeypatch):
+    monkeypatch.setattr(connect, "ANSWER_TIME", 2)
+    frozen = cluster.pids()[0]
+    os.kill(frozen, signal.SIGSTOP)
+    try:
+        with (
+            pytest.raises(StudyError, match="not told its versions within 2 s: restart workers"),
+            connected(Workers(str(cluster.scheduler), None, 60.0), print),
+        ):
+            pass
+    finally:
+        os.kill(frozen, signal.SIGCONT)
+
+
 @pytest.mark.long
 def test_a_tuning_has_the_same_slopes(cluster):
     spec = tuning(GAIN, starts=3)
@@ -232,43 +245,31 @@ def test_a_worker_that_hangs_is_restarted(cluster, local, tmp_path):
     assert_same(arrays(local), arrays(tmp_path / "out"), 1e-12)
 
 
-def killing(cluster, out, kills, seed):
-    """A thread that kills a worker whenever a few more chunks are there."""
-    rng = random.Random(seed)
+def killing(cluster, out):
+    """A thread that kills a worker when the first chunk is there, and the worker's number."""
     killed = []
 
     def kill():
-        wanted = 0
-        for _ in range(kills):
-            wanted += rng.randint(1, 2)
-            while len(list((out / CHUNKS).glob("*.h5"))) < wanted:
-                time.sleep(0.01)
-                if (out / "results.h5").exists():
-                    return
-            os.kill(rng.choice(cluster.pids()), signal.SIGKILL)
-            killed.append(wanted)
+        while not list((out / CHUNKS).glob("*.h5")):
+            time.sleep(0.01)
+            if (out / "results.h5").exists():
+                return
+        killed.append(cluster.pids()[0])
+        os.kill(killed[0], signal.SIGKILL)
 
     thread = threading.Thread(target=kill, daemon=True)
     thread.start()
     return thread, killed
 
 
-def check_kills(cluster, local, out, kills, seed):
-    thread, killed = killing(cluster, out, kills, seed)
+def test_killed_workers_lose_nothing(cluster, local, tmp_path):
+    """Many kills: tests/test_kills.py."""
+    out = tmp_path / "out"
+    thread, killed = killing(cluster, out)
     outcome, _ = told(cluster, out)
     thread.join(timeout=60)
     assert killed and outcome.n_run == CASES and len(outcome.lost) == 0
     assert_same(arrays(local), arrays(out), 1e-12)
-
-
-def test_killed_workers_lose_nothing(cluster, local, tmp_path):
-    check_kills(cluster, local, tmp_path / "out", 1, 0)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("seed", range(1, 6))
-def test_many_killed_workers_lose_nothing(cluster, local, tmp_path, seed):
-    check_kills(cluster, local, tmp_path / "out", 4, seed)
 
 
 @pytest.mark.long  # in short: a chunk that fails, and workers that are killed

@@ -10,18 +10,21 @@ import pytest
 from rich.console import Console
 
 from studies.commission import run as commissioning
+from studies.commission import stages
 from studies.commission.machines import Possible, margin_spread, margins_on, unknown_to_controller
 from studies.commission.report import CommissionFindings, summary
 from studies.commission.run import run_commission
 from studies.commission.spec import LOUDER, RESERVE, parse_measured, tuning_section
 from studies.commission.stages import STAGES, possible_machines
 from studies.engine.controller import fixed_controller
-from studies.engine.fast_motion import make_fast
+from studies.engine.fast_motion import TellingMotion, make_fast
+from studies.engine.folder import make_manifest
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.export.firmware import build as building
 from studies.show.document import schema
 from studies.study.spec import paper_study
+from studies.tuning.folder import open_tuning
 from studies.tuning.spec import parse_tuning
 from tests.commissions import (
     margin_on,
@@ -183,9 +186,9 @@ def commissioned(out, is_resumed=False):
 
 
 def test_all_stages_lead_to_firmware(monkeypatch, tmp_path):
-    stages = Pretended(monkeypatch)
+    pretended = Pretended(monkeypatch)
     made, text, page = commissioned(tmp_path / "out")
-    assert made.is_good and stages.calls == ["fit", "tune", "certificate", "firmware"]
+    assert made.is_good and pretended.calls == ["fit", "tune", "certificate", "firmware"]
     assert "gain margin 2.5 or more on 2 machines" in text and "link.youngs_modulus 7e+10" in text
     assert "tuned on a fast first move without shaper" in text
     assert "commissioned" in page and "firmware/verification.html" in page
@@ -206,9 +209,9 @@ def test_all_stages_lead_to_firmware(monkeypatch, tmp_path):
     ],
 )
 def test_what_is_not_supported_is_refused(monkeypatch, answers, last, reason, tmp_path):
-    stages = Pretended(monkeypatch, **answers)
+    pretended = Pretended(monkeypatch, **answers)
     made, text, page = commissioned(tmp_path / "out")
-    assert not made.is_good and stages.calls[-1] == last == made.outcome.done
+    assert not made.is_good and pretended.calls[-1] == last == made.outcome.done
     (refusal,) = (line for line in text.splitlines() if line.startswith("REFUSED"))
     assert re.search(reason, refusal)
     assert "To measure next: hammer 2 at the pose (0, 0.01, 0.5)." in text
@@ -216,15 +219,15 @@ def test_what_is_not_supported_is_refused(monkeypatch, answers, last, reason, tm
 
 
 def test_a_stage_is_not_done_twice(monkeypatch, tmp_path):
-    stages = Pretended(monkeypatch, stops="certificate")
+    pretended = Pretended(monkeypatch, stops="certificate")
     with pytest.raises(KeyboardInterrupt):
         commissioned(tmp_path / "out")
     with pytest.raises(StudyError, match="add --resume"):
         commissioned(tmp_path / "out")
-    stages.answers["stops"] = ""
+    pretended.answers["stops"] = ""
     made, text, _ = commissioned(tmp_path / "out", is_resumed=True)
     assert made.is_good and "stage 1 of 4, fit: already computed" in text
-    assert stages.calls == ["fit", "tune", "certificate", "certificate", "firmware"]
+    assert pretended.calls == ["fit", "tune", "certificate", "certificate", "firmware"]
     other = data(commission={"gain_margin": 3.0})
     with pytest.raises(StudyError, match="another file, data or program"):
         run_commission(parse_measured(other), tmp_path / "out", True)
@@ -239,6 +242,23 @@ def test_a_changed_answer_is_refused(monkeypatch, name, tmp_path):
     refused = pytest.raises(StudyError, match=f"{name}: damaged")
     with refused:
         run_commission(parse_measured(data()), tmp_path / "out", True)
+
+
+def test_a_tuning_killed_before_its_first_iteration_begins_again(monkeypatch, tmp_path):
+    def killed(spec, folder, is_resumed, console):
+        with open_tuning(folder, make_manifest(spec.data), is_resumed):
+            raise KeyboardInterrupt
+
+    possible = Possible(("link.damping_ratio",), np.linspace(0.01, 0.02, 20)[:, None])
+    monkeypatch.setattr(stages, "run_tuning", killed)
+    monkeypatch.setattr(stages, "fitted_study", lambda out: STUDY)
+    monkeypatch.setattr(stages, "possible_machines", lambda out: possible)
+    monkeypatch.setattr(stages, "margin_spread", lambda possible, study: 1.0)
+    monkeypatch.setattr(stages, "find_motion", lambda study: TellingMotion(study, ""))
+    tune = next(stage for stage in STAGES if stage.name == "tune")
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            tune.make(parse_measured(data()), tmp_path, Console(quiet=True))
 
 
 def test_other_data_are_another_commissioning(monkeypatch, tmp_path):

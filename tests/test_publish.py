@@ -5,7 +5,7 @@ import os
 import pytest
 
 from studies.errors import StudyError
-from studies.publish import publish
+from studies.publish import publish, replacing
 
 
 def write(folder, *names):
@@ -59,3 +59,32 @@ def test_what_killed_processes_left_is_removed_and_what_others_prepare_is_not(tm
     with publish(tmp_path) as staging:
         write(staging, "a")
     assert {path.name for path in tmp_path.iterdir()} == {"a", f".unfinished-{os.getppid()}-y"}
+
+
+def test_a_page_is_there_only_with_all_its_files(tmp_path, monkeypatch):
+    """A kill between two moves leaves neither the old page nor the new one."""
+    for name in ("a.h5", "report.html", "found.json", "old.png"):
+        (tmp_path / name).write_text(f"old {name}")
+    names, replace, seen = ("a.h5", "found.json", "report.html"), os.replace, []
+
+    def watched(*pair):
+        seen.append({path.name for path in tmp_path.glob("*.*") if path.is_file()})
+        replace(*pair)
+
+    monkeypatch.setattr(os, "replace", watched)
+    with publish(tmp_path, stale=("old.png",)) as staging:
+        write(staging, *names)
+    assert seen == [{"a.h5"}, {"a.h5"}, {"a.h5", "report.html"}]
+    assert {path.name for path in tmp_path.iterdir()} == set(names)
+
+
+def test_temporary_files_of_killed_processes_are_removed(tmp_path):
+    dead = os.spawnlp(os.P_NOWAIT, "true", "true")
+    os.waitpid(dead, 0)
+    left = f".a.{dead}-0123abcd.tmp"
+    others = [f".a.{os.getppid()}-0123abcd.tmp", f".b.{dead}-0123abcd.tmp", ".a.b.0123abcd.tmp"]
+    for name in (left, *others):
+        (tmp_path / name).write_text("half")
+    with replacing(tmp_path / "a") as temporary:
+        temporary.write_text("new")
+    assert {path.name for path in tmp_path.iterdir()} == {"a", *others}

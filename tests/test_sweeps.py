@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import random
 import resource
 import shutil
 import signal
@@ -261,61 +260,33 @@ from studies.engine import plan
 from studies.engine.sweep import run_sweep
 from studies.space.spec import parse_sweep
 plan.LANES, plan.LARGEST_CHUNK = 8, 16
-run_sweep(parse_sweep(json.loads(sys.argv[1])), Path(sys.argv[2]), "--resume" in sys.argv)
+run_sweep(parse_sweep(json.loads(sys.argv[1])), Path(sys.argv[2]))
 """
 
 
-def started(data, out, *options):
+def started(data, out):
     """A sweep in a process of its own."""
     import json
 
     root = str(Path(__file__).parents[1])
-    command = [sys.executable, "-c", SCRIPT, json.dumps(data), str(out), root, *options]
+    command = [sys.executable, "-c", SCRIPT, json.dumps(data), str(out), root]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def killed_until_done(data, out, n_kills, seed):
-    """Kill a sweep at random moments, resume, and so on; ids finished at each kill."""
-    rng = random.Random(seed)
-    seen = []
-    for kill in range(n_kills):
-        process = started(data, out, *(["--resume"] if (out / "sweep.json").exists() else []))
-        before = len(list(out.glob("*/*.h5")))
-        deadline = time.monotonic() + 120
-        wanted = before + rng.randint(0, 2)
-        while process.poll() is None and time.monotonic() < deadline:
-            if len(list(out.glob("*/*.h5"))) > wanted or (out / "results.h5").exists():
-                break
-            time.sleep(0.002)
-        time.sleep(rng.random() * 0.05)
-        process.send_signal(signal.SIGKILL)
-        process.communicate(timeout=120)
-        seen.append(set(finished_cases(out).case_id.tolist()))
-        assert kill == 0 or seen[-1] >= seen[-2]
-    return seen
-
-
-def check_kills(sweep, out, whole, n_kills, seed):
-    """Kill a sweep, resume it, and compare it with the same in one go."""
-    n = read_sweep(whole).n_cases
-    seen = killed_until_done(small(sweep), out, n_kills, seed)
-    assert any(0 < len(ids) < n for ids in seen)
-    outcome = run(small_spec(sweep), out, is_resumed=True)
-    assert outcome.n_done == n
-    assert outcome.n_run == n - len(seen[-1])  # what was finished is not run again
-    assert_same(arrays(whole), arrays(out))
-
-
-def test_killed_at_random_moments(tmp_path, mixed):
-    check_kills(MIXED, tmp_path / "killed", mixed[0], 1, 0)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("seed", range(1, 8))
-def test_killed_at_many_random_moments(tmp_path, seed):
-    sweep = MIXED | {"blocks": [MIXED["blocks"][0] | {"count": 8}]}
-    run(small_spec(sweep), tmp_path / "whole")
-    check_kills(sweep, tmp_path / "killed", tmp_path / "whole", 3, seed)
+def test_a_killed_sweep_runs_only_what_is_left(tmp_path, mixed):
+    """Kills at random moments, of all commands: tests/test_kills.py."""
+    out = tmp_path / "killed"
+    process = started(small(), out)
+    deadline = time.monotonic() + 120
+    while not list(out.glob("*/*.h5")) and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.002)
+    process.send_signal(signal.SIGKILL)
+    process.communicate(timeout=120)
+    done = finished_cases(out).case_id
+    assert 0 < len(done) < 72
+    outcome = run(small_spec(), out, is_resumed=True)
+    assert outcome.n_done == 72 and outcome.n_run == 72 - len(done)
+    assert_same(arrays(mixed[0]), arrays(out))
 
 
 def partly_done(out, spec=None):

@@ -48,6 +48,8 @@ WorkerTimeout = Annotated[
 
 #: Time limit for the scheduler to answer [s].
 PATIENCE = 15
+#: That for all workers to tell their versions, which computing does not delay [s].
+ANSWER_TIME = 60
 
 
 class Workers(NamedTuple):
@@ -116,7 +118,8 @@ def connected(workers: Workers, on_progress: Callable[[str], None]) -> Iterator[
         on_progress: called with progress messages.
 
     Raises:
-        StudyError: no extra `cluster`, no such scheduler, no worker, workers of other versions.
+        StudyError: no extra `cluster`, no such scheduler, no worker, workers of other versions or
+            without an answer.
     """
     option = "--local-workers" if workers.scheduler is None else "--scheduler"
     if workers.scheduler is not None and workers.local is not None:
@@ -252,7 +255,12 @@ def refuse_other_versions(client: Client) -> None:
 
     own, faults = identity(), []
     try:
-        answers = client.run(identity, on_error="return")
+        answers = client.run(identity, on_error="return", callback_timeout=ANSWER_TIME)
+    except TimeoutError:
+        raise StudyError(
+            f"a worker has not told its versions within {ANSWER_TIME} s: restart workers that "
+            "hang, then repeat the command"
+        ) from None
     except Exception as error:  # Dask cannot pass on every error of a worker
         raise StudyError(
             f"cannot ask workers for their versions ({error or type(error).__name__}); is "

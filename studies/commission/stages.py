@@ -26,7 +26,6 @@ from studies.spillover.run import DOCUMENT as CERTIFICATE
 from studies.spillover.run import spillover_design
 from studies.study.spec import Study, load_study
 from studies.study.template import study_template
-from studies.tuning.folder import PROGRESS
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import parse_tuning
 
@@ -66,7 +65,7 @@ def _tune(measured: MeasuredSpec, out: Path, console: Console) -> None:
         console.print(motion.text, soft_wrap=True)
     section = tuning_section(measured, motion.study, columns, spread)
     spec = parse_tuning(motion.study.model_dump() | {"tune": section})
-    run_tuning(spec, folder, (folder / PROGRESS).is_file(), console)
+    run_tuning(spec, folder, True, console)  # goes on, or begins
     chosen = with_own_motion(load_design(folder).study, fitted)
     with replacing(out / DESIGN) as temporary:
         temporary.write_text(study_template(chosen), encoding="utf-8")

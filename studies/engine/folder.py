@@ -61,13 +61,13 @@ class Content(NamedTuple):
 SWEEPS = Content(
     "a sweep",
     MANIFEST,
-    re.compile(r"\.joined\.h5|\.(joined\.h5|baseline\.h5|sweep\.json)\.[0-9a-f]{8}\.tmp"),
+    re.compile(r"\.joined\.h5|\.(joined\.h5|baseline\.h5|sweep\.json)\.(\d+-)?[0-9a-f]{8}\.tmp"),
 )
-TUNINGS = Content("a tuning", TUNING, re.compile(r"\..+\.[0-9a-f]{8}\.tmp"))
-SCREENS = Content("a screen", "screen.json", re.compile(r"\..+\.[0-9a-f]{8}\.tmp"))
+TUNINGS = Content("a tuning", TUNING, re.compile(r"\..+\.(\d+-)?[0-9a-f]{8}\.tmp"))
+SCREENS = Content("a screen", "screen.json", re.compile(r"\..+\.(\d+-)?[0-9a-f]{8}\.tmp"))
 ATLASES = Content("an atlas", "runs", re.compile(r"\.unfinished-.*"))
 #: Of a folder with a request and folders of its own in it.
-_UNFINISHED = re.compile(r"\.unfinished-.*|\..+\.[0-9a-f]{8}\.tmp")
+_UNFINISHED = re.compile(r"\.unfinished-.*|\..+\.(\d+-)?[0-9a-f]{8}\.tmp")
 COMPARISONS = Content("a comparison of laws", "request.json", _UNFINISHED)
 COMMISSIONINGS = Content("a commissioning", "request.json", _UNFINISHED)
 
