@@ -5,10 +5,11 @@
 
 `map` runs the quick tests, or the files named, and notes which statements each executes and how
 long it takes. `run` draws mutants, spread over the modules in proportion to their lines of code,
-and runs on each the tests that execute its statement, quickest first, until one fails or those
-within the budget have passed. WORK holds a copy of the checkout as it was at first; begin a new one
-after a change of `jaxmodel`. The record is a table of one line per mutant; what it holds is not
-computed anew, but for survivors that more tests within the budget could judge.
+and runs on each the tests that execute its statement, those about its module and quick ones first,
+until one fails or those within the budget have passed. WORK holds a copy of the checkout as it was
+at first; begin a new one after a change of `jaxmodel`. The record is a table of one line per
+mutant; what it holds is not computed anew, but for survivors that more tests within the budget
+could judge.
 """
 
 from __future__ import annotations
@@ -323,24 +324,25 @@ def plan(
     budget: float,
     passed: Iterable[str] = (),
 ) -> Rounds:
-    """Rounds of the quickest tests that execute one of the lines, as many as the budget allows.
+    """Rounds of tests that execute one of the lines, as many as the budget allows.
 
-    Files that import the module itself come first in their round.
+    Those of files about the module itself come first, then the quickest.
 
     Args:
         seen: tests by file.
         budget: processor time that they take without mutants [s].
         passed: left out.
     """
+    direct = _direct(mutant.file, seen)
     costs = [
-        (test.seconds, file, node)
+        (file not in direct, test.seconds, file, node)
         for file, tests in seen.items()
         for node, test in tests.items()
         if test.passed and lines.intersection(test.statements.get(mutant.file, ()))
         if node not in passed
     ]
     rounds: Rounds = [{} for _ in ROUNDS]
-    for seconds, file, node in sorted(costs):
+    for _, seconds, file, node in sorted(costs):
         budget -= seconds
         if budget < 0 and any(rounds):  # one at least
             break
@@ -348,9 +350,14 @@ def plan(
         nodes = rounds[place].setdefault(file, [])
         assert nodes is not None
         nodes.append(node)
-    name = f"{PACKAGE}.{mutant.file.removesuffix('.py').replace('/', '.')} "
-    direct = {file for file in seen if name in (reach.TOP / "tests" / file).read_text("utf-8")}
-    return [dict(sorted(tests.items(), key=lambda x: x[0] not in direct)) for tests in rounds]
+    return rounds
+
+
+def _direct(file: str, tests: Iterable[str]) -> set[str]:
+    """Tests named after a module or importing it."""
+    name = file.removesuffix(".py").replace("/", ".")
+    line, own = f"from {PACKAGE}.{name} import", f"test_{name.rpartition('.')[2]}.py"
+    return {x for x in tests if x == own or line in (reach.TOP / "tests" / x).read_text("utf-8")}
 
 
 # Commands
@@ -383,7 +390,8 @@ def run(work: Path, record: Path, count: int, seed: int, budget: float, of: list
         for path in sorted((work / "map").glob("*.json"))
     }
     rows, passed = read(record), Passed(work)
-    for mutant in islice(sample(sources, seed), count):
+    drawn = islice(sample(sources, seed), count)
+    for mutant in sorted(drawn, key=lambda x: _key(x) in rows):  # survivors last
         key = _key(mutant)
         if (of and mutant.file not in of) or (key in rows and rows[key].outcome not in OPEN):
             continue

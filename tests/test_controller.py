@@ -1,9 +1,11 @@
 """Pieces of the sampled controller by themselves."""
 
+from types import SimpleNamespace
+
 import jax
 import numpy as np
 
-from jaxmodel.controller import CORNER, soft_limit
+from jaxmodel.controller import CORNER, adc_code, read_back, soft_limit
 
 
 def test_smooth_limit_is_the_sharp_one_with_round_corners():
@@ -25,3 +27,13 @@ def test_slope_of_the_smooth_limit_has_no_jump():
 
 def test_what_is_no_number_passes_the_limit():
     assert np.isnan(soft_limit(np.nan, 1.0, True)) and np.isnan(soft_limit(np.nan, 1.0, False))
+
+
+def test_a_code_reads_back_within_half_a_step():
+    """Of a 12-bit converter that a conditioner's bias puts in the middle of its range."""
+    adc = SimpleNamespace(adc_gain=0.4, adc_bias=1.6, adc_step=3.3 / 4096, adc_top=4095.0)
+    voltage = np.linspace(-3.9, 3.9, 1001)
+    code, is_clipped = adc_code(adc, voltage, None)
+    assert not is_clipped.any()
+    half = adc.adc_step / adc.adc_gain / 2
+    np.testing.assert_allclose(read_back(adc, code), voltage, atol=half * (1 + 1e-9))
