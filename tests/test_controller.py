@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 
+from jaxmodel.channels import strongest
 from jaxmodel.controller import CORNER, adc_code, read_back, soft_limit
 
 
@@ -37,3 +38,11 @@ def test_a_code_reads_back_within_half_a_step():
     assert not is_clipped.any()
     half = adc.adc_step / adc.adc_gain / 2
     np.testing.assert_allclose(read_back(adc, code), voltage, atol=half * (1 + 1e-9))
+
+
+def test_of_rivals_the_one_of_highest_energy_acts():
+    omega = np.array([[100.0, 200.0, 0.0], [100.0, 200.0, 300.0]])
+    value = np.array([[1.0, 0.1, 0.0], [1.0, 0.1, 0.0]])
+    rate = np.array([[0.0, 90.0, 1e9], [0.0, 99.0, 0.0]])
+    # energies: 1e4 against 400 + 8100, and 1e4 against 400 + 9801 and 0
+    assert strongest(omega, value, rate).tolist() == [[1, 0, 1], [0, 1, 0]]
