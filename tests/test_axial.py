@@ -15,6 +15,7 @@ from jaxmodel.kinematics import close_chain
 from jaxmodel.linear import Moment, linearise, natural_modes
 from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import prepare
+from jaxmodel.simulate import command
 from studies.engine.preflight import check_run
 from studies.engine.runs import _simulate
 from studies.engine.stability import loop_report, run_report
@@ -208,6 +209,25 @@ def test_a_load_beyond_the_critical_force_is_a_status(share, code):
     if code == status.BUCKLED:
         with pytest.raises(StudyError, match=r"load.wrench.*115.1 N .here link .: 116.3 N"):
             check_run(study.change(load__wrench=(0.0, 0.0, moment)))
+
+
+def test_links_buckle_before_a_path_leaves_the_reach():
+    """The fault that comes first is the one that counts, and when it comes."""
+    study = BARE.change(run__duration=0.1, shaper__kind="none", motion__waypoints=(HOME, HOME))
+    structure, case = arrays(study)
+    structure = structure._replace(has_wrench=True)
+    away = case.path._replace(waypoints=HOME_POSE + np.array([[0, 0, 0], [0, 1.0, 0]]))
+
+    @jax.jit
+    def faults(moment):
+        load = case.load._replace(wrench=np.array([0, 0, 1.0]) * moment)
+        loaded = case._replace(path=away, load=load)
+        found = command(structure, loaded, prepare(structure, loaded))
+        return found.status, found.bad_time
+
+    code, time = faults(0.0)
+    assert code == status.OUT_OF_REACH and 0 < time < study.motion.move_time
+    assert faults(-1.01 * N_CR * 5.0 / statics((0.0, 0.0, 5.0))[0]) == (status.BUCKLED, 0)
 
 
 def test_a_steady_load_is_held_and_a_pulse_moves_the_platform():

@@ -13,6 +13,10 @@ from jaxmodel.beam import BASES, build_basis, held_frequency, pinned_free_roots
 from jaxmodel.mechanisms.prrr.paper import paper_machine
 from jaxmodel.parameters import Damping
 from jaxmodel.plant import damping_ratio
+from jaxmodel.prepare import coupled_rate
+from jaxmodel.response import held_modes
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.spec import paper_study
 
 MACHINE = paper_machine()
 BEAM, PATCHES = MACHINE.beam, MACHINE.patches
@@ -118,6 +122,29 @@ def test_pinned_free_roots_and_frequencies():
     np.testing.assert_allclose(np.tan(root), np.tanh(root), rtol=1e-12)
     basis = low_basis("pinned_free")
     np.testing.assert_allclose(frequencies_hz(basis)[0], [178.7, 579, 1208], rtol=5e-4)
+
+
+def test_links_off_their_chords_limit_the_step_by_the_shortest():
+    study = paper_study().change(
+        link__basis="pinned_free", link__length=(0.22, 0.2, 0.24), link__modes=3
+    )
+    found = coupled_rate(build_structure(study), as_arrays(build_case(study)))
+    omega = (pinned_free_roots(3)[-1] / 0.2) ** 2 * np.sqrt(BARE_STIFFNESS / LINE_MASS)
+    np.testing.assert_allclose(found, omega, rtol=1e-12)
+    on_chord = study.change(link__basis="pinned_pinned")
+    assert coupled_rate(build_structure(on_chord), as_arrays(build_case(on_chord))) == 0
+
+
+def test_modes_of_links_alone():
+    """Between held joints, of links of three lengths."""
+    length = np.array([0.2, 0.22, 0.24])
+    study = paper_study().change(link__length=tuple(length), link__damping_ratio=0.02)
+    modes = jax.jit(held_modes, static_argnums=0)
+    hertz, zeta = modes(build_structure(study), as_arrays(build_case(study)))
+    n = np.arange(1, hertz.shape[1] + 1)
+    wanted = np.pi / 2 * np.sqrt(BARE_STIFFNESS / LINE_MASS) * (n / length[:, None]) ** 2
+    np.testing.assert_allclose(hertz, wanted, rtol=1e-10)
+    np.testing.assert_allclose(zeta, 0.02, rtol=1e-12)
 
 
 def test_frequencies_of_held_ends():

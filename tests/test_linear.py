@@ -154,3 +154,12 @@ def test_released_link_moves_like_the_finite_element_link():
     np.testing.assert_allclose(deflection[::2, 0], given, atol=0.001 * 5e-5)
     # the neighbours feel that its chord grows and shrinks by 31 nm
     assert 0 < np.abs(deflection[:, 1:]).max() < 1e-3 * 5e-5
+
+
+def test_a_linear_machine_rests_at_the_last_way_point():
+    study = UNDAMPED.change(motion__waypoints=(HOME, (0.0, 0.01, HOME[2]), (0.01, 0.02, HOME[2])))
+    structure = build_structure(study)._replace(is_linear=True)
+    pose = jax.jit(lambda case: prepare(structure, case).loop.rest.pose)(
+        as_arrays(build_case(study))
+    )
+    assert pose.tolist() == [0.01, 0.02, HOME[2]]

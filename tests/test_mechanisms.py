@@ -95,6 +95,18 @@ def test_accelerations_equal_lagrangian_and_multiplier_form(name, kind, shorteni
     check_forms(found, lagrangian, multipliers)
 
 
+def test_two_links_hold_the_joint_between_them_by_the_sine_of_their_angle():
+    machine = MACHINES["five-bar"]
+    _, plant = make("pinned_pinned", machine)
+    motion, _ = states(machine)
+    still = np.zeros(2)
+    chain = jax.vmap(lambda pose: kinematics.close_chain(plant, pose, still))(motion.pose)
+    angle = np.arctan2(chain.frame.y, chain.frame.x)
+    np.testing.assert_allclose(
+        jax.vmap(kinematics.hold)(chain), np.abs(np.sin(angle[:, 1] - angle[:, 0])), rtol=1e-12
+    )
+
+
 # --- the sampled loop -----------------------------------------------------------------------------
 
 #: Where loops are judged, and the first way-point.

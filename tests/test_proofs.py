@@ -111,6 +111,13 @@ def test_a_disc_with_a_singular_member_is_not_excluded():
         assert (excludes_zero(Disc(mid[None], rad[None]))[0] < 1) == is_excluded
 
 
+def test_a_bound_is_the_spectral_radius_of_equal_radii():
+    """|F0^-1| R of radii r everywhere about the identity has n r, in regular arithmetic."""
+    mid, rad = np.eye(3, dtype=complex)[None], np.full((1, 3, 3), 0.1)
+    with np.errstate(divide="raise", invalid="raise"):
+        np.testing.assert_allclose(excludes_zero(Disc(mid, rad)), 0.3, rtol=1e-6)
+
+
 # --- the return difference ------------------------------------------------------------------------
 
 

@@ -14,6 +14,14 @@ from jaxmodel.loop import PlantState, State, _freeze_if_bad, _sample
 from jaxmodel.simulate import Outline, conclude
 from studies.engine.runs import judged_status
 
+
+def test_every_status_has_a_number_and_a_reason_of_its_own():
+    """Numbers stand in files: none may change."""
+    codes = [x for name, x in vars(status).items() if name.isupper() and isinstance(x, int)]
+    assert codes == list(range(25)) == list(status.REASONS)
+    assert len(set(status.REASONS.values())) == len(codes)
+
+
 # --- how a run ends -------------------------------------------------------------------------------
 
 LIMIT, TOLERANCE, CRITICAL, MARGIN, RADIUS = 0.05, 1e-3, (30.0, 20.0, 25.0), 0.1, 0.07

@@ -1,0 +1,520 @@
+"""Mutation testing: small faults put into `jaxmodel`, one at a time; does a quick test fail?
+
+    python -m tests.mutants map WORK [test_beam.py ...]
+    python -m tests.mutants run WORK RECORD --count 300 --seed 0 --budget 60 [--of beam.py ...]
+
+`map` runs the quick tests, or the files named, and notes which statements each executes and how
+long it takes. `run` draws mutants, spread over the modules in proportion to their lines of code,
+and runs on each the tests that execute its statement, those about its module and quick ones first,
+until one fails or those within the budget have passed. WORK holds a copy of the checkout as it was
+at first; begin a new one after a change of `jaxmodel`. The record is a table of one line per
+mutant; what it holds is not computed anew, but for survivors that more tests within the budget
+could judge.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import compileall
+import csv
+import json
+import random
+from bisect import bisect
+from collections.abc import Iterable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tests import reach
+from tests.reach import Ended, Seen
+
+PACKAGE = "jaxmodel"
+#: Tests of the text of the sources, which any change could fail.
+OF_TEXT = ("test_house.py", "test_words.py", "test_mutants.py")
+#: What takes the place of an operator.
+OPERATORS: dict[type[ast.AST], tuple[str, ...]] = {
+    ast.Add: ("+", "-"),
+    ast.Sub: ("-", "+"),
+    ast.Mult: ("*", "/"),
+    ast.Div: ("/", "*"),
+    ast.FloorDiv: ("//", "*"),
+    ast.Mod: ("%", "//"),
+    ast.Pow: ("**", "*"),
+    ast.MatMult: ("@", "@ -"),
+    ast.BitAnd: ("&", "|"),
+    ast.BitOr: ("|", "&"),
+    ast.Lt: ("<", "<=", ">="),
+    ast.LtE: ("<=", "<", ">"),
+    ast.Gt: (">", ">=", "<="),
+    ast.GtE: (">=", ">", "<"),
+    ast.Eq: ("==", "!="),
+    ast.NotEq: ("!=", "=="),
+    ast.Is: ("is", "is not"),
+    ast.IsNot: ("is not", "is"),
+    ast.In: ("in", "not in"),
+    ast.NotIn: ("not in", "in"),
+    ast.And: ("and", "or"),
+    ast.Or: ("or", "and"),
+}
+_PAIRS = (
+    *("sin cos", "min max", "minimum maximum", "any all", "argmin argmax", "floor ceil"),
+    *("zeros ones", "real imag", "zeros_like ones_like", "sinh cosh", "amin amax", "sum prod"),
+)
+#: What takes the place of a function.
+FUNCTIONS = {x: y for pair in _PAIRS for x, y in (pair.split(), reversed(pair.split()))}
+#: Rounds of tests: the longest of each [s].
+ROUNDS = (1.0, 4.0, float("inf"))
+#: Processor time beyond what the tests take by themselves [s], and the factor on that.
+GRACE, SLACK = 60.0, 4.0
+#: Processor time for all tests of a file [s].
+MAP_LIMIT = 900.0
+#: Outcomes that further tests could change.
+OPEN = ("survived", "unreached")
+
+
+#: Tests by file, one round after another.
+Rounds = list[dict[str, list[str] | None]]
+
+
+class Mutant(NamedTuple):
+    """One change of the code."""
+
+    file: str  # in the package
+    line: int
+    column: int
+    operator: str
+    before: str
+    after: str
+
+
+class Verdict(NamedTuple):
+    """What became of a mutant; a line of the record, after the mutant."""
+
+    outcome: str  # killed, survived, unreached or, by hand, equivalent
+    by: str  # the test that failed, or why the mutant is equivalent
+    tests: int  # that have judged it
+    seconds: float  # of processor time
+
+
+# Mutants
+
+
+def mutants(source: str, file: str = "") -> list[Mutant]:
+    """All mutants of a module, in the order of its text."""
+    finder = _Finder(source, file)
+    finder.visit(ast.parse(source))
+    return sorted(set(finder.found))
+
+
+def mutated(source: str, mutant: Mutant) -> str:
+    """The module with the change."""
+    lines = source.encode().splitlines(keepends=True)
+    start = sum(map(len, lines[: mutant.line - 1])) + mutant.column
+    text = source.encode()
+    before = mutant.before.encode()
+    assert text[start : start + len(before)] == before
+    return (text[:start] + mutant.after.encode() + text[start + len(before) :]).decode()
+
+
+class _Finder(ast.NodeVisitor):
+    """Collects mutants, except in annotations, texts, raised errors, decorators and assertions."""
+
+    def __init__(self, source: str, file: str) -> None:
+        self._text, self._file = source.encode(), file
+        lines = self._text.splitlines(keepends=True)
+        self._starts = [sum(map(len, lines[:k])) for k in range(len(lines) + 1)]
+        self._is_in_function = False
+        self.found: list[Mutant] = []
+
+    def _span(self, node: Any) -> tuple[int, int]:
+        return (
+            self._starts[node.lineno - 1] + node.col_offset,
+            self._starts[node.end_lineno - 1] + node.end_col_offset,
+        )
+
+    def _add(self, operator: str, start: int, end: int, after: str) -> None:
+        line = bisect(self._starts, start)
+        before = self._text[start:end].decode()
+        column = start - self._starts[line - 1]
+        self.found.append(Mutant(self._file, line, column, operator, before, after))
+
+    def _replace(self, operator: str, node: ast.AST, after: str) -> None:
+        self._add(operator, *self._span(node), after)
+
+    def _source(self, node: ast.AST) -> str:
+        start, end = self._span(node)
+        return self._text[start:end].decode()
+
+    def _exchange(self, operator: ast.AST, left: ast.AST, right: ast.AST) -> None:
+        """The operator between two operands; there are but brackets and spaces beside it."""
+        before, *others = OPERATORS.get(type(operator), ("",))
+        gap = self._span(left)[1], self._span(right)[0]
+        at = self._text.find(before.encode(), *gap)
+        for after in others:
+            self._add("operator", at, at + len(before), after)
+
+    def visit_BinOp(self, node: ast.BinOp) -> None:
+        is_of_types = isinstance(node.op, ast.BitOr) and not self._is_in_function
+        if not is_of_types:
+            self._exchange(node.op, node.left, node.right)
+        self.generic_visit(node)
+
+    def visit_Compare(self, node: ast.Compare) -> None:
+        operands = [node.left, *node.comparators]
+        for operator, left, right in zip(node.ops, operands, operands[1:], strict=False):
+            self._exchange(operator, left, right)
+        self.generic_visit(node)
+
+    def visit_BoolOp(self, node: ast.BoolOp) -> None:
+        self._exchange(node.op, *node.values[:2])
+        self.generic_visit(node)
+
+    def visit_UnaryOp(self, node: ast.UnaryOp) -> None:
+        if isinstance(node.op, ast.USub | ast.Not | ast.Invert):
+            name = "sign" if isinstance(node.op, ast.USub) else "condition"
+            self._replace(name, node, self._source(node.operand))
+        self.generic_visit(node)
+
+    def visit_Constant(self, node: ast.Constant) -> None:
+        value = node.value
+        if isinstance(value, bool):
+            self._replace("constant", node, str(not value))
+        elif isinstance(value, int):
+            self._replace("number", node, str(value + 1))
+        elif isinstance(value, float | complex):
+            self._replace("number", node, repr(2 * value or 1.0))
+
+    def visit_Call(self, node: ast.Call) -> None:
+        if len(node.args) > 1:
+            self._swap(*node.args[:2])
+        name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+        if name in FUNCTIONS:
+            end = self._span(node.func)[1]
+            self._add("function", end - len(name), end, FUNCTIONS[name])
+        self.generic_visit(node)
+
+    def _swap(self, left: ast.expr, right: ast.expr) -> None:
+        first, second = self._source(left), self._source(right)
+        is_text = any(isinstance(getattr(x, "value", None), str) for x in (left, right))
+        if not is_text and not isinstance(left, ast.Starred) and first != second:
+            between = self._text[self._span(left)[1] : self._span(right)[0]].decode()
+            start, end = self._span(left)[0], self._span(right)[1]
+            self._add("arguments", start, end, f"{second}{between}{first}")
+
+    def _condition(self, node: Any) -> None:
+        if "TYPE_CHECKING" not in ast.unparse(node.test):
+            self._replace("condition", node.test, f"not ({self._source(node.test)})")
+            self.generic_visit(node)
+
+    visit_If = visit_While = visit_IfExp = _condition  # noqa: N815
+
+    def visit_comprehension(self, node: ast.comprehension) -> None:
+        for condition in node.ifs:
+            self._replace("condition", condition, f"not ({self._source(condition)})")
+        self.generic_visit(node)
+
+    def visit_Expr(self, node: ast.Expr) -> None:
+        if not isinstance(node.value, ast.Constant):  # a docstring
+            self._replace("statement", node, "pass")
+            self.generic_visit(node)
+
+    def visit_AugAssign(self, node: ast.AugAssign) -> None:
+        self._replace("statement", node, "pass")
+        self.generic_visit(node)
+
+    def visit_Raise(self, node: ast.Raise) -> None:
+        self._replace("statement", node, "pass")
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
+        outer, self._is_in_function = self._is_in_function, True
+        for part in (*node.args.defaults, *filter(None, node.args.kw_defaults), *node.body):
+            self.visit(part)
+        self._is_in_function = outer
+
+    def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
+        if node.value:
+            self.visit(node.value)
+
+    def visit_keyword(self, node: ast.keyword) -> None:
+        if node.arg != "strict":  # of zip: an assertion
+            self.visit(node.value)
+
+    def visit_JoinedStr(self, node: ast.JoinedStr) -> None:
+        """Texts stay."""
+
+    def visit_Assert(self, node: ast.Assert) -> None:
+        """What tests cannot fail by."""
+
+
+def lines_of_code(source: str) -> int:
+    """Without blank lines, comments and docstrings."""
+    texts = {
+        line
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+        for line in range(node.lineno, (node.end_lineno or node.lineno) + 1)
+    }
+    lines = enumerate(source.splitlines(), start=1)
+    return sum(k not in texts and line.strip()[:1] not in ("", "#") for k, line in lines)
+
+
+def sample(sources: dict[str, str], seed: int) -> Iterator[Mutant]:
+    """Mutants, each of the module that lags furthest behind its share of the lines of code.
+
+    sources: by file. Of each place, one mutant at most.
+    """
+    rng = random.Random(seed)
+    waiting = {file: _drawn(source, file, rng) for file, source in sources.items()}
+    size = {file: lines_of_code(sources[file]) for file in sources if waiting[file]}
+    drawn = dict.fromkeys(size, 0)
+    while size:
+        total = sum(drawn.values()) + 1
+        file = max(size, key=lambda x: total * size[x] / sum(size.values()) - drawn[x])
+        yield waiting[file].pop()
+        drawn[file] += 1
+        if not waiting[file]:
+            del size[file], drawn[file]
+
+
+def _drawn(source: str, file: str, rng: random.Random) -> list[Mutant]:
+    """The mutants of a module in random order, one for each place."""
+    places: dict[tuple[int, int, str], list[Mutant]] = {}
+    for mutant in mutants(source, file):
+        places.setdefault(mutant[1:4], []).append(mutant)
+    found = [rng.choice(x) for x in places.values()]
+    rng.shuffle(found)
+    return found
+
+
+# Tests of a mutant
+
+
+def statements(source: str, mutant: Mutant) -> set[int]:
+    """Lines of the statements one of which a test should execute to notice the mutant.
+
+    The statement itself in a function; the whole function for a default, otherwise the module.
+    """
+    tree, place = ast.parse(source), (mutant.line, mutant.column)
+    around = [
+        node
+        for node in ast.walk(tree)  # outer ones first
+        if isinstance(node, ast.stmt) and _begin(node) <= place < _end(node)
+    ]
+    functions = [node for node in around if isinstance(node, ast.FunctionDef)]
+    if functions and functions[0] is not around[-1]:
+        return {around[-1].lineno}
+    wider = functions[0] if functions else tree
+    inner = [x for node in ast.walk(wider) if isinstance(node, ast.FunctionDef) for x in node.body]
+    return {x.lineno for node in inner for x in ast.walk(node) if isinstance(x, ast.stmt)}
+
+
+def _begin(node: ast.stmt) -> tuple[int, int]:
+    return node.lineno, node.col_offset
+
+
+def _end(node: ast.stmt) -> tuple[int, int]:
+    return node.end_lineno or 0, node.end_col_offset or 0
+
+
+def plan(
+    seen: dict[str, dict[str, Seen]],
+    mutant: Mutant,
+    lines: set[int],
+    budget: float,
+    passed: Iterable[str] = (),
+) -> Rounds:
+    """Rounds of tests that execute one of the lines, as many as the budget allows.
+
+    Those of files about the module itself come first, then the quickest.
+
+    Args:
+        seen: tests by file.
+        budget: processor time that they take without mutants [s].
+        passed: left out.
+    """
+    direct = _direct(mutant.file, seen)
+    costs = [
+        (file not in direct, test.seconds, file, node)
+        for file, tests in seen.items()
+        for node, test in tests.items()
+        if test.passed and lines.intersection(test.statements.get(mutant.file, ()))
+        if node not in passed
+    ]
+    rounds: Rounds = [{} for _ in ROUNDS]
+    for _, seconds, file, node in sorted(costs):
+        budget -= seconds
+        if budget < 0 and any(rounds):  # one at least
+            break
+        place = next(k for k, longest in enumerate(ROUNDS) if seconds <= longest)
+        nodes = rounds[place].setdefault(file, [])
+        assert nodes is not None
+        nodes.append(node)
+    return rounds
+
+
+def _direct(file: str, tests: Iterable[str]) -> set[str]:
+    """Tests named after a module or importing it."""
+    name = file.removesuffix(".py").replace("/", ".")
+    line, own = f"from {PACKAGE}.{name} import", f"test_{name.rpartition('.')[2]}.py"
+    return {x for x in tests if x == own or line in (reach.TOP / "tests" / x).read_text("utf-8")}
+
+
+# Commands
+
+
+def map_tests(work: Path, files: list[str]) -> None:
+    """Note what tests execute, of named files or of all that are not noted yet."""
+    base = _base(work)
+    for path in [reach.TOP / "tests" / file for file in files]:
+        (base / "tests" / path.name).write_bytes(path.read_bytes())
+        Passed(work).forget(path.name)
+    tests = sorted(path.name for path in (base / "tests").glob("test_*.py"))
+    for file in files or [x for x in tests if not _notes(work, x).exists() and x not in OF_TEXT]:
+        ended = reach.run(base, [{file: None}], MAP_LIMIT, watches=True)
+        _notes(work, file).write_text(json.dumps(ended.tests), encoding="utf-8")
+        spent = sum(test.seconds for test in ended.tests.values())
+        print(f"{file}: {len(ended.tests)} tests, {spent:.0f} s {ended.failed}", flush=True)
+
+
+def run(work: Path, record: Path, count: int, seed: int, budget: float, of: list[str]) -> None:
+    """Judge the mutants that the record lacks, and write it after each."""
+    base = _base(work)
+    folder = base / PACKAGE
+    sources = {
+        path.relative_to(folder).as_posix(): path.read_text(encoding="utf-8")
+        for path in sorted(folder.rglob("*.py"))
+    }
+    seen = {
+        path.stem: {node: Seen(*test) for node, test in json.loads(path.read_text("utf-8")).items()}
+        for path in sorted((work / "map").glob("*.json"))
+    }
+    rows, passed = read(record), Passed(work)
+    drawn = islice(sample(sources, seed), count)
+    for mutant in sorted(drawn, key=lambda x: _key(x) in rows):  # survivors last
+        key = _key(mutant)
+        if (of and mutant.file not in of) or (key in rows and rows[key].outcome not in OPEN):
+            continue
+        lines = statements(sources[mutant.file], mutant)
+        rounds = plan(seen, mutant, lines, budget, passed.of(key))
+        if key not in rows or _count(rounds):
+            ended = judge(work, mutant, rounds, budget)
+            passed.add(key, ended)
+            rows[key] = verdict(ended, rows.get(key))
+            write(record, rows)
+            print(*key, *rows[key], sep="  ", flush=True)
+
+
+def judge(work: Path, mutant: Mutant, rounds: Rounds, budget: float) -> Ended:
+    """Run tests on a copy with a mutant."""
+    if not _count(rounds):
+        return Ended({}, "")
+    top = work.resolve() / "mutant"
+    reach.copy(top, _base(work))
+    path = top / PACKAGE / mutant.file
+    for compiled in path.parent.glob(f"__pycache__/{path.stem}.*"):  # as old and as long, perhaps
+        compiled.unlink()
+    path.write_text(mutated(path.read_text(encoding="utf-8"), mutant), encoding="utf-8")
+    return reach.run(top, rounds, GRACE + SLACK * budget)
+
+
+def verdict(ended: Ended, before: Verdict | None) -> Verdict:
+    """Of tests that have run, after others that have passed."""
+    tests = len(ended.tests) + (before.tests if before else 0)
+    seconds = sum(x.seconds for x in ended.tests.values()) + (before.seconds if before else 0.0)
+    outcome = "killed" if ended.failed else "survived" if tests else "unreached"
+    return Verdict(outcome, ended.failed, tests, round(seconds, 1))
+
+
+class Passed:
+    """Tests that have let mutants pass, kept in a file."""
+
+    def __init__(self, work: Path) -> None:
+        self._path = work / "passed.json"
+        self._nodes: dict[str, list[str]] = (
+            json.loads(self._path.read_text("utf-8")) if self._path.exists() else {}
+        )
+
+    def of(self, mutant: Mutant) -> set[str]:
+        return set(self._nodes.get(str(mutant), ()))
+
+    def add(self, mutant: Mutant, ended: Ended) -> None:
+        nodes = self._nodes.setdefault(str(mutant), [])
+        nodes += [node for node, test in ended.tests.items() if test.passed]
+        self._write()
+
+    def forget(self, file: str) -> None:
+        """The tests of a file, which have changed."""
+        for nodes in self._nodes.values():
+            nodes[:] = [node for node in nodes if not node.startswith(f"tests/{file}::")]
+        self._write()
+
+    def _write(self) -> None:
+        self._path.write_text(json.dumps(self._nodes), encoding="utf-8")
+
+
+def _count(rounds: Rounds) -> int:
+    return sum(len(nodes or ()) for tests in rounds for nodes in tests.values())
+
+
+def _base(work: Path) -> Path:
+    """The copy of the checkout, made at first."""
+    base = work.resolve() / "base"
+    if not base.exists():
+        (work / "map").mkdir(parents=True, exist_ok=True)
+        reach.copy(base, reach.TOP)
+        compileall.compile_dir(base / PACKAGE, quiet=1)
+    return base
+
+
+def _notes(work: Path, file: str) -> Path:
+    return work / "map" / f"{file}.json"
+
+
+def _key(mutant: Mutant) -> Mutant:
+    """As the record says it, without line breaks."""
+    before, after = (" ".join(text.split()) for text in (mutant.before, mutant.after))
+    return mutant._replace(before=before, after=after)
+
+
+def read(record: Path) -> dict[Mutant, Verdict]:
+    """A record; empty if there is none."""
+    if not record.exists():
+        return {}
+    with record.open(encoding="utf-8", newline="") as file:
+        _, *rows = csv.reader(file, delimiter="\t", quoting=csv.QUOTE_NONE)
+    return {
+        Mutant(file, int(line), int(column), *change): Verdict(
+            outcome, by, int(tests), float(seconds)
+        )
+        for file, line, column, *change, outcome, by, tests, seconds in rows
+    }
+
+
+def write(record: Path, rows: dict[Mutant, Verdict]) -> None:
+    """Replace a record."""
+    lines = [(*Mutant._fields, *Verdict._fields), *(x + y for x, y in sorted(rows.items()))]
+    text = "".join("\t".join(map(str, line)) + "\n" for line in lines)
+    temporary = record.with_suffix(".tmp")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(record)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m tests.mutants")
+    commands = parser.add_subparsers(dest="command", required=True)
+    mapping, running = commands.add_parser("map"), commands.add_parser("run")
+    mapping.add_argument("work", type=Path)
+    mapping.add_argument("files", nargs="*", help="tests")
+    running.add_argument("work", type=Path)
+    running.add_argument("record", type=Path)
+    running.add_argument("--count", type=int, default=300)
+    running.add_argument("--seed", type=int, default=0)
+    running.add_argument("--budget", type=float, default=60.0, help="of tests for one mutant [s]")
+    running.add_argument("--of", nargs="*", default=[], help="files of the package, by default all")
+    options = vars(parser.parse_args())
+    {"map": map_tests, "run": run}[options.pop("command")](**options)
+
+
+if __name__ == "__main__":
+    main()
