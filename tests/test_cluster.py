@@ -7,11 +7,13 @@ import threading
 import time
 from contextlib import ExitStack
 from itertools import islice
+from types import SimpleNamespace
 
 import dask
 import jax
 import numpy as np
 import pytest
+from distributed.comm.core import CommClosedError
 from rich.console import Console
 
 from studies.cluster import connect
@@ -164,6 +166,14 @@ def test_other_versions_are_refused(cluster, tmp_path):
         pass
     with pytest.raises(StudyError, match=f"jaxlib 0.1 .client: {identity()['jaxlib']}"):
         told(cluster, tmp_path / "late")  # a worker that came after the others were compared
+
+
+def test_a_worker_that_dies_when_asked_is_no_other_version():
+    answers = {"tcp://a": CommClosedError("in <TCP>: Stream is closed"), "tcp://b": identity()}
+    connect.refuse_other_versions(SimpleNamespace(run=lambda *_, **__: answers))
+    answers["tcp://c"] = OSError("no such file")
+    with pytest.raises(StudyError, match="do not match this client: tcp://c: no such file;"):
+        connect.refuse_other_versions(SimpleNamespace(run=lambda *_, **__: answers))
 
 
 def test_a_frozen_worker_does_not_hold_up_what_connects(cluster, monkeypatch):

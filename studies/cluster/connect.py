@@ -251,6 +251,8 @@ def _graphics(number: int) -> dict[str, str]:
 
 def refuse_other_versions(client: Client) -> None:
     """Raise StudyError if a worker has other versions than this process."""
+    from distributed.comm.core import CommClosedError
+
     from studies.cluster.worker import difference, identity
 
     own, faults = identity(), []
@@ -267,6 +269,8 @@ def refuse_other_versions(client: Client) -> None:
             "flexlink-studies installed there?"
         ) from None
     for address, answer in answers.items():
+        if isinstance(answer, CommClosedError):
+            continue  # it died meanwhile; the next one tells its versions with each chunk
         if isinstance(answer, Exception):
             faults.append(f"{address}: {str(answer) or type(answer).__name__}")
         elif difference(answer, own):
