@@ -181,6 +181,15 @@ def test_kept_designs_are_a_sweep_with_the_same_ids(whole):
     assert spec.sweep.fidelity == "full"
 
 
+def test_kept_designs_have_the_margins_of_the_sweep(whole, tmp_path):
+    _, done = whole
+    run_sweep(load_sweep(whole[0] / BEST), tmp_path / "sweep", is_quiet=True)
+    data = read_sweep(tmp_path / "sweep")
+    np.testing.assert_allclose(done.margin, data["gain_margin"], rtol=1e-9)
+    lines = summary_lines(done)
+    assert f"of the best {KEEP}, {np.sum(done.margin < 1)} are unstable" in lines[2]
+
+
 class Stopped(LocalScreener):
     """Ends after some shards, as if it had been killed."""
 
@@ -256,6 +265,7 @@ def test_damaged_tallies_are_refused(whole, tmp_path):
     changed("endings", good["endings"].data + 1)
     changed("row", good["row"].data + 10_000)
     changed("sketch", -good["sketch"].data)
+    changed("value", good["value"].data * 1.01)
     changed("is_done", np.zeros(4, np.int8))
     (tmp_path / TALLY).write_bytes((out / TALLY).read_bytes()[:3000])
     with pytest.raises(StudyError):

@@ -17,6 +17,7 @@ from studies.show.figures import styled
 from studies.show.pages import page
 from studies.show.units import headed, readable
 from studies.space.table import build_table
+from studies.study.margin import ENOUGH, margin_text
 from studies.study.template import toml_text
 from studies.sweeps.plots import save_plot
 
@@ -72,6 +73,18 @@ def summary_lines(done: ScreenOutcome) -> list[str]:
     lines.append(
         f"the best {len(tally.row)} by {screen.entry}: {best} to {last}; median of all: {half}"
     )
+    margin = done.margin[~np.isnan(done.margin)]
+    if not margin.size:
+        return lines
+    unstable, safe = np.sum(margin < 1), np.sum(margin > ENOUGH)
+    lines.append(
+        f"of the best {margin.size}, {unstable} are unstable and {safe} have a gain margin above "
+        f"{ENOUGH:g}"
+    )
+    if safe:
+        first = int(np.argmax(done.margin > ENOUGH))
+        value, text = quantity(done, tally.value[first]), margin_text(done.margin[first])
+        lines.append(f"the best of these: design {tally.row[first]} with {value}, margin {text}")
     return lines
 
 
@@ -101,7 +114,12 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
             drawn=list(drawings) if len(tally.row) else [],
             endings=ending_rows(done),
             quantiles=quantile_rows(done),
-            heads=("number", headed(screen.entry, unit_of(done)), *screen.axes.names),
+            heads=(
+                "design",
+                headed(screen.entry, unit_of(done)),
+                "gain margin",
+                *screen.axes.names,
+            ),
             rows=_best_rows(done),
             lost=done.lost,
         )
@@ -120,8 +138,11 @@ def _best_rows(done: ScreenOutcome) -> list[tuple[str, ...]]:
         (
             str(row),
             f"{factor * value:.4g}",
+            margin_text(margin),
             *(f"{numbers[name][place[row]]:.4g}" for name in done.screen.axes.names),
         )
-        for row, value in zip(rows.tolist(), done.tally.value.tolist(), strict=False)
+        for row, value, margin in zip(
+            rows.tolist(), done.tally.value.tolist(), done.margin.tolist(), strict=False
+        )
         if row in place
     ]

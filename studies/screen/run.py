@@ -18,6 +18,7 @@ from studies import config
 from studies.engine.folder import locked_folder
 from studies.engine.progress import Phases, duration_text
 from studies.engine.sweep import interrupts
+from studies.screen.margins import kept_margins
 from studies.screen.shards import ScreenRequest, shard_tally
 from studies.screen.stored import begin, write_best, write_tally
 from studies.screen.tally import LEFT_OUT, Tally, merged, only_left_out
@@ -123,6 +124,7 @@ class ScreenOutcome(NamedTuple):
     tally: Tally
     lost: dict[int, str]  # shards that were given up, and why
     is_interrupted: bool  # by Ctrl-C
+    margin: np.ndarray  # gain margins of the designs kept, NaN: not judged, (k,)
 
 
 def run_screen(
@@ -169,6 +171,14 @@ def run_screen(
         is_interrupted = stop.is_set() and not is_done.all()
         if not is_interrupted:
             write_best(out, screen, tally)
+    margin = np.full(len(tally.row), np.nan)
+    if not is_interrupted:
+        margin = kept_margins(screen, tally.row)
     return ScreenOutcome(
-        screen=screen, is_done=is_done, tally=tally, lost=lost, is_interrupted=is_interrupted
+        screen=screen,
+        is_done=is_done,
+        tally=tally,
+        lost=lost,
+        is_interrupted=is_interrupted,
+        margin=margin,
     )

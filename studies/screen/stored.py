@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,7 @@ def begin(folder: Path, screen: ScreenRequest) -> tuple[np.ndarray, Tally]:
 def read_tally(folder: Path, screen: ScreenRequest) -> tuple[np.ndarray, Tally]:
     """Which shards of a screen are done, and their tally; errors as `begin`."""
     path, empty = folder / TALLY, nothing(screen.axes)
-    variables, _ = read_store(path)
+    variables, attributes = read_store(path)
     try:
         is_done = variables["is_done"].data > 0
         tally = Tally(**{name: variables[name].data for name in Tally._fields})
@@ -75,10 +76,20 @@ def read_tally(folder: Path, screen: ScreenRequest) -> tuple[np.ndarray, Tally]:
         or tally.n_designs != n_done
     ):
         raise _damaged(path, "numbers of designs")
+    if attributes.get("digest") != _digest(is_done, tally):
+        raise _damaged(path, "not what was written")
     is_row = (tally.row >= 0) & (tally.row < screen.n_designs)
     if tally.row.shape != tally.value.shape or len(tally.row) > screen.keep or not is_row.all():
         raise _damaged(path, "designs kept")
     return is_done, tally
+
+
+def _digest(is_done: np.ndarray, tally: Tally) -> str:
+    """Hash of a tally's numbers."""
+    digest = blake2b(np.packbits(is_done).tobytes(), digest_size=8)
+    for name, array in tally._asdict().items():
+        digest.update(np.asarray(array, float if name == "value" else np.int64).tobytes())
+    return digest.hexdigest()
 
 
 def _damaged(path: Path, what: str) -> StudyError:
@@ -105,7 +116,12 @@ def write_tally(folder: Path, screen: ScreenRequest, is_done: np.ndarray, tally:
             np.arange(N_ENDINGS), ("ending",), "1", "status code; the last one: left out by where"
         ),
     }
-    attributes = {"title": screen.spec.study.title, "by": screen.by, "n_designs": screen.n_designs}
+    attributes = {
+        "title": screen.spec.study.title,
+        "by": screen.by,
+        "n_designs": screen.n_designs,
+        "digest": _digest(is_done, tally),
+    }
     write_store(folder / TALLY, variables, attributes)
 
 
