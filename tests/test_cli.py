@@ -534,5 +534,6 @@ print(*sorted(lacking))
     assert run.stdout.split() == [
         "studies.cluster.runner",
         "studies.cluster.worker",
+        "studies.screen.workers",
         "studies.tuning.workers",
     ], run.stderr
