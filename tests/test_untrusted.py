@@ -283,3 +283,13 @@ def test_results_that_are_no_file_are_no_results(tmp_path, sweep, capsys):
     with pytest.raises(SystemExit):
         main(["show", str(tmp_path / "nothing")])
     assert "not the folder of a sweep" in capsys.readouterr().err
+
+
+def test_a_tuning_whose_columns_do_not_fit_is_damaged(tmp_path):
+    (folder,) = originals("tuned folder", tmp_path / "originals")
+    with h5py.File(folder / "tune.h5", "r+") as file:
+        del file["objective"]
+        file["objective"] = 1.0
+        file["objective"].attrs.update({"units": "1", "long_name": "x"})
+    with pytest.raises(StudyError, match="damaged .objective: not one value for each starting"):
+        KINDS["tuned folder"].read(folder)

@@ -63,6 +63,17 @@ class ExplorerTable(NamedTuple):
                 return column
         raise KeyError(name)
 
+    def checked(self) -> ExplorerTable:
+        """Itself.
+
+        Raises:
+            ValueError: a column has not one value a row.
+        """
+        for column in self.columns:
+            if np.shape(column.value) != (len(self.status),):
+                raise ValueError(f"{column.name}: not one value for each {self.noun}")
+        return self
+
     @property
     def order(self) -> np.ndarray:
         """Rows, the best first, those without a value last, (n,)."""

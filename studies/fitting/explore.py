@@ -40,27 +40,27 @@ def explore_fit(folder: Path, on_progress: Callable[[int, int], None]) -> Explor
         rise = np.concatenate([data["optimum_rise"].data, np.full(len(machines), np.nan)])
         names = [str(name) for name in data["number"].data]
         study = parse_study(parse_json(attributes["study"]))
+        parameters = [
+            Column(name, "", values[:, k], is_parameter=True, is_log=is_wide(values[:, k]))
+            for k, name in enumerate(names)
+        ]
+        return ExplorerTable(
+            title=study.title,
+            noun="machine",
+            columns=(
+                text_column("kind", kinds, is_parameter=True),
+                *parameters,
+                Column(DISTANCE, "", away, better="smallest"),
+                Column("rise of chi square", "", rise, better="smallest"),
+            ),
+            status=np.zeros(len(values), int),
+            reasons={0: "ok"},
+            names=tuple(str(k + 1) for k in range(len(values))),
+            rank=DISTANCE,
+            about={"fitted": ", ".join(names), "machine": machine_text(study)},
+        ).checked()
     except (LookupError, ValueError, TypeError, AttributeError) as error:
         raise StudyError(f"{folder / FIT}: damaged ({error})") from None
-    parameters = [
-        Column(name, "", values[:, k], is_parameter=True, is_log=is_wide(values[:, k]))
-        for k, name in enumerate(names)
-    ]
-    return ExplorerTable(
-        title=study.title,
-        noun="machine",
-        columns=(
-            text_column("kind", kinds, is_parameter=True),
-            *parameters,
-            Column(DISTANCE, "", away, better="smallest"),
-            Column("rise of chi square", "", rise, better="smallest"),
-        ),
-        status=np.zeros(len(values), int),
-        reasons={0: "ok"},
-        names=tuple(str(k + 1) for k in range(len(values))),
-        rank=DISTANCE,
-        about={"fitted": ", ".join(names), "machine": machine_text(study)},
-    )
 
 
 def _distances(gaps: np.ndarray, data: Mapping[str, Variable]) -> np.ndarray:

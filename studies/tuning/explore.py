@@ -56,7 +56,7 @@ def explore_tuning(folder: Path, on_progress: Callable[[int, int], None]) -> Exp
                 "baseline": baseline_text(spec.study),
             },
             notes=_is_stale(folder, attributes),
-        )
+        ).checked()
     except (LookupError, ValueError, TypeError, AttributeError) as error:
         raise StudyError(f"{folder / RESULTS}: damaged ({error})") from None
     families = {family.name: family for family in spec.families}
