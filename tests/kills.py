@@ -40,6 +40,9 @@ from studies.cli import main
 from studies.engine import plan
 
 plan.LANES, plan.LARGEST_CHUNK = 8, 16
+if sys.argv[1] == "screen":
+    from studies.screen import shards
+    shards.SHARD, shards.LANES = 64, 8
 place, step = os.environ["KILL_PLACE"], int(os.environ["KILL_STEP"])
 changes, count = {"os.rename", "os.remove", "os.rmdir", "os.mkdir"}, [0]
 
@@ -65,7 +68,15 @@ main()
 #: Longest that a command may take, and that what it has started may outlive it [s].
 LIMIT, GRACE = 900, 10
 #: Names of what only serves to go on, and of what a file says of one call.
-WORKING = {"sweep.json", "tune.json", "request.json", "progress.npz", "chunks", "cache"}
+WORKING = {
+    "sweep.json",
+    "screen.json",
+    "tune.json",
+    "request.json",
+    "progress.npz",
+    "chunks",
+    "cache",
+}
 OF_ONE_CALL = {"results", "git", "run_time", "compile_time"}
 
 
@@ -370,6 +381,7 @@ COMMANDS = {
     "sweep, empty cache": ("sweep", "../../sweep.toml", *ON),
     "sweep, local workers": ("sweep", "../../longer.toml", *ON, "--local-workers", "2"),
     "extension": ("sweep", "../../longer.toml", *ON),
+    "screen": ("screen", "../../many.toml", "--keep", "20", *ON),
     "tune": ("tune", "../../tune.toml", *ON),
     "atlas": ("atlas", "../../study.toml", *ON),
     "plot": ("plot", "out"),
@@ -383,6 +395,8 @@ COMMANDS = {
     "twin": ("twin", "../../study.toml", *OUT),
     "verify": ("verify", "../../study.toml", "--json"),
 }
+#: Axes of a screen.
+GAINS = {"gain": {"from": 0.1, "to": 1.0}, "emc_exponent": {"from": 0.0, "to": 1.0}}
 #: Those that begin in the folder of a finished sweep.
 AFTER_SWEEP = ("extension", "plot", "explore")
 COMMISSION = Command("commission", ("commission", "../../commission.toml", *ON))
@@ -399,6 +413,7 @@ def write_files(folder):
     files = {
         "sweep": small(),
         "longer": small(more),
+        "many": small({"method": "random", "count": 1000, "axes": GAINS}),
         "stiffer": small(more, drive={"kp": 4e4}),
         "tune": SMALL | {"tune": {"free": GAIN, "starts": 3, "iterations": 6}},
         "fit": fit,

@@ -75,7 +75,7 @@ def screen_of(
     by: str = "",
     keep: int = 1000,
     fidelity: str = "linear",
-    shard_size: int = SHARD,
+    shard_size: int = 0,
 ) -> ScreenRequest:
     """A screen of a sweep's designs.
 
@@ -84,7 +84,7 @@ def screen_of(
         by: metric, or entry of one; "": what the sweep ranks by.
         keep: most designs kept.
         fidelity: model of the runs, "linear" or "full".
-        shard_size: designs of a shard.
+        shard_size: designs of a shard; 0: `SHARD`.
 
     Raises:
         StudyError: a sweep that cannot be screened, or a bad metric.
@@ -117,7 +117,7 @@ def screen_of(
         keep=keep,
         n_designs=n_designs,
         axes=divided(_distinct(axis_numbers(table))),
-        shard_size=shard_size,
+        shard_size=shard_size or SHARD,
     )
 
 
