@@ -71,6 +71,7 @@ LIMIT, GRACE = 900, 10
 WORKING = {
     "sweep.json",
     "screen.json",
+    "screen.h5",
     "tune.json",
     "request.json",
     "progress.npz",
