@@ -17,7 +17,7 @@ from jaxmodel.frequency_response import close_loop, command_gain
 from jaxmodel.linear import linearise, resting
 from jaxmodel.loop_figures import MARGINS, MOST_DELAY, PEAKS, guaranteed_range
 from jaxmodel.prepare import prepare
-from jaxmodel.robustness import margin_at, norm_peaks, search_frequencies
+from jaxmodel.robustness import coarse_norm, margin_at, norm_peaks, search_frequencies
 from jaxmodel.sampled_loop import analogue_plant, closed_loop, delayed_loop, delayed_parts
 from jaxmodel.scaling import best_scaling
 from studies.engine import diagonal_scaling
@@ -331,6 +331,15 @@ def smallest_norm(matrix: np.ndarray) -> float:
         x = np.append(y, 0.0)
         best = min(best, np.linalg.norm(matrix * np.exp(x[:, None] - x), 2))
     return best
+
+
+def test_a_coarse_norm_is_high_by_a_root_of_the_size_at_most():
+    """Sixty-four powers of A'A: the trace has all n singular values, the norm one."""
+    rng = np.random.default_rng(4)
+    for n in range(1, 8):
+        matrix = rng.normal(size=(n, n)) * 10.0**n + 1j * rng.normal(size=(n, n))
+        ratio = coarse_norm(matrix) / np.linalg.norm(matrix, 2)
+        assert 1 - 1e-9 < ratio < n ** (1 / 128) + 1e-9
 
 
 def test_the_scaling_is_the_best_one():
