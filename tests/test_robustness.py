@@ -359,6 +359,24 @@ def test_the_scaling_is_the_best_one():
         assert norm == pytest.approx(searched[0], rel=1e-9)
 
 
+def test_the_slope_of_a_bound_where_singular_values_coincide():
+    """Of the best scaling, two of which are then largest, against differences."""
+    scaled = jax.jit(best_scaling)
+    for seed, n in ((8, 3), (5, 4), (4, 6), (7, 6)):
+        rng = np.random.default_rng(seed)
+        matrix = rng.normal(size=(n, n)) * (1 - np.eye(n)) + 0.2 * (seed % 2) * np.eye(n)
+        found, change = scaled(matrix + 0j), rng.normal(size=(n, n))
+        x = np.asarray(found.log_scale)
+        largest = np.linalg.svd(matrix * np.exp(x[:, None] - x))[1][:2]
+        assert largest[1] == pytest.approx(largest[0], rel=1e-6)
+        ends = [float(scaled(matrix + h * change + 0j).bound) for h in (1e-5, -1e-5)]
+        slope = np.real(np.sum(np.conj(found.slope) * change))
+        assert slope == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-3)
+    # sqrt(m12 m21)
+    slope = scaled(np.array([[0, 4.0], [1.0, 0]]) + 0j).slope
+    np.testing.assert_allclose(slope, [[0, 0.25], [1.0, 0]], rtol=1e-5, atol=1e-9)
+
+
 @pytest.mark.parametrize("law", ["imsc", "lqr"])
 def test_the_disk_margin_is_the_smallest_over_all_frequencies(law):
     loop = loop_of("plain", law, LOOPS[law])
