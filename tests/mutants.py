@@ -19,9 +19,9 @@ import ast
 import compileall
 import csv
 import json
-import random
 from bisect import bisect
 from collections.abc import Iterable, Iterator
+from hashlib import sha256
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -63,6 +63,8 @@ _PAIRS = (
 )
 #: What takes the place of a function.
 FUNCTIONS = {x: y for pair in _PAIRS for x, y in (pair.split(), reversed(pair.split()))}
+#: Functions whose first two arguments may change places.
+SYMMETRIC = {"maximum", "minimum", "max", "min", "hypot"}
 #: Rounds of tests: the longest of each [s].
 ROUNDS = (1.0, 4.0, float("inf"))
 #: Processor time beyond what the tests take by themselves [s], and the factor on that.
@@ -184,9 +186,9 @@ class _Finder(ast.NodeVisitor):
             self._replace("number", node, repr(2 * value or 1.0))
 
     def visit_Call(self, node: ast.Call) -> None:
-        if len(node.args) > 1:
-            self._swap(*node.args[:2])
         name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+        if len(node.args) > 1 and name not in SYMMETRIC:
+            self._swap(*node.args[:2])
         if name in FUNCTIONS:
             end = self._span(node.func)[1]
             self._add("function", end - len(name), end, FUNCTIONS[name])
@@ -260,10 +262,10 @@ def lines_of_code(source: str) -> int:
 def sample(sources: dict[str, str], seed: int) -> Iterator[Mutant]:
     """Mutants, each of the module that lags furthest behind its share of the lines of code.
 
-    sources: by file. Of each place, one mutant at most.
+    sources: by file. Of each place, one mutant at most. A change of the code leaves those drawn
+    elsewhere.
     """
-    rng = random.Random(seed)
-    waiting = {file: _drawn(source, file, rng) for file, source in sources.items()}
+    waiting = {file: _drawn(source, file, seed) for file, source in sources.items()}
     size = {file: lines_of_code(sources[file]) for file in sources if waiting[file]}
     drawn = dict.fromkeys(size, 0)
     while size:
@@ -275,14 +277,15 @@ def sample(sources: dict[str, str], seed: int) -> Iterator[Mutant]:
             del size[file], drawn[file]
 
 
-def _drawn(source: str, file: str, rng: random.Random) -> list[Mutant]:
-    """The mutants of a module in random order, one for each place."""
-    places: dict[tuple[int, int, str], list[Mutant]] = {}
-    for mutant in mutants(source, file):
-        places.setdefault(mutant[1:4], []).append(mutant)
-    found = [rng.choice(x) for x in places.values()]
-    rng.shuffle(found)
-    return found
+def _drawn(source: str, file: str, seed: int) -> list[Mutant]:
+    """The mutants of a module by a hash of their text, one for each place."""
+    lines = source.splitlines()
+
+    def rank(mutant: Mutant) -> bytes:
+        return sha256(repr((seed, lines[mutant.line - 1], mutant[2:])).encode()).digest()
+
+    places = {mutant[1:4]: mutant for mutant in sorted(mutants(source, file), key=rank)}
+    return list(places.values())
 
 
 # Tests of a mutant

@@ -163,3 +163,9 @@ def test_a_linear_machine_rests_at_the_last_way_point():
         as_arrays(build_case(study))
     )
     assert pose.tolist() == [0.01, 0.02, HOME[2]]
+
+
+def test_shapes_have_a_largest_entry_of_one():
+    shape = natural_modes(linear(UNDAMPED)).shape
+    largest = shape[np.argmax(np.abs(shape), axis=0), np.arange(shape.shape[1])]
+    np.testing.assert_allclose(largest, 1.0, rtol=1e-12)
