@@ -19,6 +19,8 @@ from jaxmodel.parameters import Array
 SWEEPS, STEPS = 6, 64
 #: Distance of gamma from sigma^2, as a share of it: first, last, and its factor in a step.
 FIRST, LAST, SHRINK = 0.3, 1e-9, 0.45
+#: Such a distance, and Newton's steps to its centre, for the slope.
+NEAR, CENTRING = 1e-6, 12
 #: Newton decrement below which gamma may fall, and the largest |x| [1].
 CENTRED, WIDEST = 0.5, 25.0
 
@@ -69,29 +71,43 @@ def best_scaling(matrix: Array) -> BestScaling:
 
     def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
         number, x, distance, least, best = state
-        a = _apply(matrix, x)
-        square = jnp.linalg.eigvalsh(jnp.conj(a.T) @ a)[-1]
+        square = _square_norm(matrix, x)
         best = jnp.where(square < least, x, best)
-        gradient, curvature = _barrier(a, square * (1 + distance))
-        move = -jnp.linalg.solve(curvature, gradient)
-        decrement = jnp.sqrt(jnp.maximum(-jnp.sum(move * gradient), 0.0))
-        x = jnp.clip(x + move / (1 + decrement), -WIDEST, WIDEST)
+        x, decrement = _newton(matrix, x, square * (1 + distance))
         distance = jnp.where(decrement < CENTRED, distance * SHRINK, distance)
         return number + 1, x, distance, jnp.minimum(square, least), best
 
     x = _balance(matrix)
     start = 0, x, jnp.array(FIRST, x.dtype), jnp.array(jnp.inf, x.dtype), x
-    *_, distance, _, x = jax.lax.while_loop(
-        lambda state: (state[0] < STEPS) & (state[2] > LAST), step, start
-    )
+    *_, x = jax.lax.while_loop(lambda state: (state[0] < STEPS) & (state[2] > LAST), step, start)
+    square = jnp.maximum(_square_norm(matrix, x), 0.0)
+    return BestScaling(jnp.sqrt(square), x, _slope(matrix, x, square * (1 + NEAR)))
+
+
+def _square_norm(matrix: Array, x: Array) -> Array:
     a = _apply(matrix, x)
-    value, vector = jnp.linalg.eigh(jnp.conj(a.T) @ a)
-    bound = jnp.sqrt(jnp.maximum(value[-1], 0.0))
-    # the singular vectors count as the barrier weighs them: several where some coincide
-    weight = 1 / (value[-1] * (1 + distance) - value)
-    z = (vector * weight) @ jnp.conj(vector.T) / jnp.sum(weight)
-    slope = a @ z / jnp.maximum(bound, jnp.finfo(bound.dtype).tiny)
-    return BestScaling(bound, x, slope * jnp.exp(x[:, None] - x))
+    return jnp.linalg.eigvalsh(jnp.conj(a.T) @ a)[-1]
+
+
+def _newton(matrix: Array, x: Array, gamma: Array) -> tuple[Array, Array]:
+    """A damped step towards the centre of gamma, (n,), and Newton's decrement before it."""
+    gradient, curvature = _barrier(_apply(matrix, x), gamma)
+    move = -jnp.linalg.solve(curvature, gradient)
+    decrement = jnp.sqrt(jnp.maximum(-jnp.sum(move * gradient), 0.0))
+    return jnp.clip(x + move / (1 + decrement), -WIDEST, WIDEST), decrement
+
+
+def _slope(matrix: Array, x: Array, gamma: Array) -> Array:
+    """Slope of the bound at the centre of gamma.
+
+    There (gamma - A'A)^-1 weighs singular vectors as the minimum does, several where some coincide.
+    At the best D itself it would not: no derivative is zero there.
+    """
+    x = jax.lax.fori_loop(0, CENTRING, lambda _, x: _newton(matrix, x, gamma)[0], x)
+    a = _apply(matrix, x)
+    weight = jnp.linalg.inv(gamma * np.eye(a.shape[0]) - jnp.conj(a.T) @ a)
+    size = jnp.real(jnp.trace(weight)) * jnp.sqrt(gamma)
+    return a @ weight / size * jnp.exp(x[:, None] - x)
 
 
 def _barrier(a: Array, gamma: Array) -> tuple[Array, Array]:

@@ -19,9 +19,9 @@ import ast
 import compileall
 import csv
 import json
-import random
 from bisect import bisect
 from collections.abc import Iterable, Iterator
+from hashlib import sha256
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -63,14 +63,14 @@ _PAIRS = (
 )
 #: What takes the place of a function.
 FUNCTIONS = {x: y for pair in _PAIRS for x, y in (pair.split(), reversed(pair.split()))}
+#: Functions whose first two arguments may change places.
+SYMMETRIC = {"maximum", "minimum", "max", "min", "hypot"}
 #: Rounds of tests: the longest of each [s].
 ROUNDS = (1.0, 4.0, float("inf"))
 #: Processor time beyond what the tests take by themselves [s], and the factor on that.
 GRACE, SLACK = 60.0, 4.0
 #: Processor time for all tests of a file [s].
 MAP_LIMIT = 900.0
-#: Outcomes that further tests could change.
-OPEN = ("survived", "unreached")
 
 
 #: Tests by file, one round after another.
@@ -91,7 +91,7 @@ class Mutant(NamedTuple):
 class Verdict(NamedTuple):
     """What became of a mutant; a line of the record, after the mutant."""
 
-    outcome: str  # killed, survived, unreached or, by hand, equivalent
+    outcome: str  # killed, survived or, by hand, equivalent
     by: str  # the test that failed, or why the mutant is equivalent
     tests: int  # that have judged it
     seconds: float  # of processor time
@@ -186,9 +186,9 @@ class _Finder(ast.NodeVisitor):
             self._replace("number", node, repr(2 * value or 1.0))
 
     def visit_Call(self, node: ast.Call) -> None:
-        if len(node.args) > 1:
-            self._swap(*node.args[:2])
         name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+        if len(node.args) > 1 and name not in SYMMETRIC:
+            self._swap(*node.args[:2])
         if name in FUNCTIONS:
             end = self._span(node.func)[1]
             self._add("function", end - len(name), end, FUNCTIONS[name])
@@ -262,10 +262,10 @@ def lines_of_code(source: str) -> int:
 def sample(sources: dict[str, str], seed: int) -> Iterator[Mutant]:
     """Mutants, each of the module that lags furthest behind its share of the lines of code.
 
-    sources: by file. Of each place, one mutant at most.
+    sources: by file. Of each place, one mutant at most. A change of the code leaves those drawn
+    elsewhere.
     """
-    rng = random.Random(seed)
-    waiting = {file: _drawn(source, file, rng) for file, source in sources.items()}
+    waiting = {file: _drawn(source, file, seed) for file, source in sources.items()}
     size = {file: lines_of_code(sources[file]) for file in sources if waiting[file]}
     drawn = dict.fromkeys(size, 0)
     while size:
@@ -277,14 +277,15 @@ def sample(sources: dict[str, str], seed: int) -> Iterator[Mutant]:
             del size[file], drawn[file]
 
 
-def _drawn(source: str, file: str, rng: random.Random) -> list[Mutant]:
-    """The mutants of a module in random order, one for each place."""
-    places: dict[tuple[int, int, str], list[Mutant]] = {}
-    for mutant in mutants(source, file):
-        places.setdefault(mutant[1:4], []).append(mutant)
-    found = [rng.choice(x) for x in places.values()]
-    rng.shuffle(found)
-    return found
+def _drawn(source: str, file: str, seed: int) -> list[Mutant]:
+    """The mutants of a module by a hash of their text, one for each place."""
+    lines = source.splitlines()
+
+    def rank(mutant: Mutant) -> bytes:
+        return sha256(repr((seed, lines[mutant.line - 1], mutant[2:])).encode()).digest()
+
+    places = {mutant[1:4]: mutant for mutant in sorted(mutants(source, file), key=rank)}
+    return list(places.values())
 
 
 # Tests of a mutant
@@ -326,7 +327,8 @@ def plan(
 ) -> Rounds:
     """Rounds of tests that execute one of the lines, as many as the budget allows.
 
-    Those of files about the module itself come first, then the quickest.
+    Those of files about the module itself come first, then the quickest. Where no test executes
+    any, as of a table that is made on import, those about the module do instead, or any.
 
     Args:
         seen: tests by file.
@@ -334,15 +336,23 @@ def plan(
         passed: left out.
     """
     direct = _direct(mutant.file, seen)
-    costs = [
-        (file not in direct, test.seconds, file, node)
+    every = [
+        (
+            file not in direct,
+            test.seconds,
+            file,
+            node,
+            lines & {*test.statements.get(mutant.file, ())},
+        )
         for file, tests in seen.items()
         for node, test in tests.items()
-        if test.passed and lines.intersection(test.statements.get(mutant.file, ()))
-        if node not in passed
+        if test.passed
     ]
+    able = [x for x in every if x[-1]] or [x for x in every if not x[0]] or every
     rounds: Rounds = [{} for _ in ROUNDS]
-    for _, seconds, file, node in sorted(costs):
+    for _, seconds, file, node, _ in sorted(able, key=lambda x: x[:4]):
+        if node in passed:
+            continue
         budget -= seconds
         if budget < 0 and any(rounds):  # one at least
             break
@@ -393,11 +403,11 @@ def run(work: Path, record: Path, count: int, seed: int, budget: float, of: list
     drawn = islice(sample(sources, seed), count)
     for mutant in sorted(drawn, key=lambda x: _key(x) in rows):  # survivors last
         key = _key(mutant)
-        if (of and mutant.file not in of) or (key in rows and rows[key].outcome not in OPEN):
+        if (of and mutant.file not in of) or (key in rows and rows[key].outcome != "survived"):
             continue
         lines = statements(sources[mutant.file], mutant)
         rounds = plan(seen, mutant, lines, budget, passed.of(key))
-        if key not in rows or _count(rounds):
+        if any(rounds):
             ended = judge(work, mutant, rounds, budget)
             passed.add(key, ended)
             rows[key] = verdict(ended, rows.get(key))
@@ -407,8 +417,6 @@ def run(work: Path, record: Path, count: int, seed: int, budget: float, of: list
 
 def judge(work: Path, mutant: Mutant, rounds: Rounds, budget: float) -> Ended:
     """Run tests on a copy with a mutant."""
-    if not _count(rounds):
-        return Ended({}, "")
     top = work.resolve() / "mutant"
     reach.copy(top, _base(work))
     path = top / PACKAGE / mutant.file
@@ -422,8 +430,7 @@ def verdict(ended: Ended, before: Verdict | None) -> Verdict:
     """Of tests that have run, after others that have passed."""
     tests = len(ended.tests) + (before.tests if before else 0)
     seconds = sum(x.seconds for x in ended.tests.values()) + (before.seconds if before else 0.0)
-    outcome = "killed" if ended.failed else "survived" if tests else "unreached"
-    return Verdict(outcome, ended.failed, tests, round(seconds, 1))
+    return Verdict("killed" if ended.failed else "survived", ended.failed, tests, round(seconds, 1))
 
 
 class Passed:
@@ -451,10 +458,6 @@ class Passed:
 
     def _write(self) -> None:
         self._path.write_text(json.dumps(self._nodes), encoding="utf-8")
-
-
-def _count(rounds: Rounds) -> int:
-    return sum(len(nodes or ()) for tests in rounds for nodes in tests.values())
 
 
 def _base(work: Path) -> Path:

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from jaxmodel import status
+from jaxmodel.case import Structure
 from jaxmodel.delay import LONGEST, command_change
 from jaxmodel.electronics import measurement_chain
+from jaxmodel.frequency_response import command_gain, response_of_loop
 from jaxmodel.nominal_loop import nominal_loop
 from jaxmodel.pairs import Pair
 from jaxmodel.prepare import prepare
@@ -58,6 +60,27 @@ def test_command_changes_once_a_sample(delay, before, after, share):
     np.testing.assert_array_equal(change.before, order == before)
     np.testing.assert_array_equal(change.after, order == after)
     assert float(change.share) == share
+
+
+def test_a_command_that_changes_within_samples_needs_a_step_on_either_side():
+    plain = Structure(substeps=3)
+    assert [plain._replace(has_delay=x).plant_steps for x in (False, True)] == [3, 6]
+    assert plain._replace(has_delay=True, feedback="none").plant_steps == 3
+
+
+def test_whole_samples_of_delay_turn_the_phase_alone():
+    """Of the gain around the loop, whose delay is one sample where the study says nothing."""
+
+    @partial(jax.jit, static_argnums=0)
+    def gain(structure, case):
+        response = response_of_loop(structure, case, prepare(structure, case).loop, np.array(HOME))
+        return command_gain(response, omega)
+
+    omega = 2 * np.pi * 200.0
+    structure, case = arrays(small(3.0))
+    late, once = (gain(structure._replace(has_delay=x), case) for x in (True, False))
+    turned = once * np.exp(-2j * omega * case.electronics.period)
+    np.testing.assert_allclose(late, turned, atol=1e-9 * np.abs(once).max())
 
 
 def test_exponential_by_arithmetic():

@@ -9,6 +9,8 @@ import pytest
 
 from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
+from jaxmodel.laws.contract import check_law
+from jaxmodel.table import PartError
 from studies.engine.chunks import distinct_loops, judge_cases
 from studies.engine.margins import judge_loops
 from studies.engine.runs import run_study
@@ -286,3 +288,17 @@ def test_a_comparison_writes_a_page_whose_order_is_that_of_the_runs(tmp_path, mo
     assert "strong + PD" in html and html.count("data:image/png;base64,") == 1
     with pytest.raises(StudyError, match="another design, budget or program"):
         laws.run_laws(STUDY, tmp_path / "out", 40.0, 0.4, is_resumed=True, is_quiet=True)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"design": 3}, "law 'x': design = 3; expected a function"),
+        ({"channel": "link"}, "law 'x': channel = 'link'; allowed: 'mode', 'patch' or 'none'"),
+        ({"parameters": "a"}, "expected a Parameter"),
+    ],
+)
+def test_descriptions_of_laws_are_checked(change, message):
+    check_law(LAWS["imsc"])
+    with pytest.raises(PartError, match=message):
+        check_law(LAWS["imsc"]._replace(name="x", **change))

@@ -11,7 +11,7 @@ from jaxmodel.linear import flatten, frequency_response, linearise, natural_mode
 from jaxmodel.loop import PlantState
 from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import prepare
-from jaxmodel.simulate import simulate
+from jaxmodel.simulate import _about, simulate
 from studies.reference import tables
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import paper_study
@@ -163,3 +163,15 @@ def test_a_linear_machine_rests_at_the_last_way_point():
         as_arrays(build_case(study))
     )
     assert pose.tolist() == [0.01, 0.02, HOME[2]]
+
+
+def test_shapes_have_a_largest_entry_of_one():
+    shape = natural_modes(linear(UNDAMPED)).shape
+    largest = shape[np.argmax(np.abs(shape), axis=0), np.arange(shape.shape[1])]
+    np.testing.assert_allclose(largest, 1.0, rtol=1e-12)
+
+
+def test_a_function_about_rest_is_its_tangent():
+    linear = _about(lambda pose, rate: pose**2 + 3 * rate + rate**2, np.array([2.0]))
+    pose, rate = np.array([[2.0], [2.5]]), np.array([[0.0], [0.5]])
+    np.testing.assert_allclose(linear(pose, rate), [[4.0], [4 + 4 * 0.5 + 1.5]], rtol=1e-14)

@@ -10,6 +10,7 @@ import pytest
 
 from jaxmodel import dynamics, kinematics, status
 from jaxmodel.beam import build_basis
+from jaxmodel.mechanisms.prrr.guides import Guides
 from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.plant import build_plant
 from studies import cli
@@ -343,3 +344,10 @@ def test_a_sketch_draws_each_link_and_patch_to_scale():
         for height in (width, 5 * thickness)
     ]
     np.testing.assert_allclose(sorted(drawn), sorted(pairs), rtol=1e-9, atol=1e-9)
+
+
+def test_links_across_their_guides_are_misplaced():
+    """A joint must lie between 0 and the link's length inside its guide, with some margin."""
+    guides = Guides(ux=np.ones(4), uy=np.zeros(4), s0=np.zeros(4), h0=np.zeros(4))
+    found = guides.misplaced(np.zeros(4), np.array([0.0, 0.1, 0.2, 0.25]), np.full(4, 0.2))
+    assert [text[:6] for text in found] == ["link 1", "link 3", "link 4"]

@@ -106,6 +106,12 @@ def assert_return_difference(study, points):
         np.testing.assert_allclose(complex(found), wanted, rtol=3e-4)
 
 
+def test_the_return_difference_has_positions_as_they_are_measured():
+    """Differences take them without a filter; at high frequencies images of the spectrum matter."""
+    study = STUDY.change(control__law="lqr", electronics__estimator="difference")
+    assert_return_difference(study, ((3.0, 1.0), (114.4, 0.5), (250.0, 0.5)))
+
+
 #: Forces against soft drives with hardly any damping.
 LOADED = {
     "load__wrench": (30.0, -20.0, 0.5),

@@ -238,6 +238,13 @@ def test_spectral_density_is_that_of_scipy():
     np.testing.assert_allclose(found, 0.7**2 / 2 * N * PERIOD / 1.5)
 
 
+def test_spectra_are_taken_within_a_tenth_of_the_plant_s_frequencies():
+    bases = SimpleNamespace(plant_omega=2 * np.pi * np.array([[100.0, 400.0]]))
+    found = spectrum_frequencies(SimpleNamespace(n_frequencies=5), bases)
+    np.testing.assert_allclose(found[0, 0], [90, 95, 100, 105, 110], rtol=1e-12)
+    np.testing.assert_allclose(found[0, 1], 4 * found[0, 0], rtol=1e-12)
+
+
 def test_what_never_happens_is_zero():
     """Tension of a link that is only compressed, the settling of one that never left the band."""
     run = made_up(1)

@@ -222,3 +222,14 @@ def test_shaped_paths_in_a_batch_and_their_gradients():
     for omega, value in zip(omegas, together, strict=True):
         np.testing.assert_allclose(value, velocity(omega), rtol=1e-12, atol=1e-16)
     check_grads(velocity, (700.0,), order=1, modes=["fwd", "rev"], eps=1e-3, rtol=1e-6)
+
+
+def test_points_within_samples_may_be_anywhere():
+    """Those before and after a command changes, the same in every sample."""
+    path, period = quick_path(), 4 * STEP
+    within = np.array([0.0, 0.1, 0.2, 0.6]) * period
+    late = Taps(jnp.array([0.25, 0.75]), jnp.array([0, 2]))
+    found = shape_path(path, late, 41, 4, STEP, jnp.asarray(within)).position
+    time = (np.arange(11)[:, None] * period + within).ravel()[:41]
+    now, before = (sample_path(path, jnp.maximum(time - n * period, 0)).position for n in (0, 2))
+    np.testing.assert_allclose(found, 0.25 * now + 0.75 * before, atol=1e-14)

@@ -8,7 +8,7 @@ from scipy.linalg import expm, solve_discrete_are
 
 from jaxmodel.bases import find_bases
 from jaxmodel.controller import controller_step, rest_controller
-from jaxmodel.laws.bending import BENDING, bent
+from jaxmodel.laws.bending import BENDING, bent, walk
 from jaxmodel.laws.link_model import link_model
 from jaxmodel.laws.observer import corrections
 from jaxmodel.prepare import design_controller
@@ -345,3 +345,11 @@ def test_kernel_is_scan_at_the_limits(law):
     assert np.max(one.metrics.peak_voltage) == 2
     for name in structure.metrics:
         np.testing.assert_allclose(other.metrics[name], one.metrics[name], rtol=1e-9)
+
+
+def test_slow_forces_walk_as_far_as_new_ones_at_the_corner():
+    """A sum of steps w has the spectrum w^2/(omega T)^2 below half the sample rate."""
+    case = as_arrays(build_case(parse_study({"control": {"law": "lqg"}})))
+    force = np.array([1.0, 2.0, 3.0])
+    corner, period = 2 * np.pi * case.control.parameters["bending_hz"], case.electronics.period
+    np.testing.assert_allclose(walk(case, force) / (corner * period), force, rtol=1e-12)

@@ -1,6 +1,7 @@
 """Proofs of stability: against eigenvalues of plants with 200 modes and of machines of the box."""
 
 import json
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -116,6 +117,19 @@ def test_a_bound_is_the_spectral_radius_of_equal_radii():
     mid, rad = np.eye(3, dtype=complex)[None], np.full((1, 3, 3), 0.1)
     with np.errstate(divide="raise", invalid="raise"):
         np.testing.assert_allclose(excludes_zero(Disc(mid, rad)), 0.3, rtol=1e-6)
+
+
+@pytest.mark.parametrize("changed", ["omega", "zeta", "spring"])
+def test_resonances_of_a_link_that_differs_are_its_own(changed):
+    """1 + spring/E - x^2 + 2 i zeta x of three links, one of them slightly different."""
+    loop = {name: np.full((3, 1), x) for name, x in (("omega", 5.0), ("zeta", 0.01), ("spring", 0))}
+    loop[changed] = loop[changed] + np.array([[0.0], [0.02], [0.0]])
+    setup, point = SimpleNamespace(loop=SimpleNamespace(**loop)), np.zeros(1)
+    nu, stiffness = Disc(np.array([4.0]), point), Disc(np.array([1.1]), point)
+    found = zero_exclusion._resonance(setup, nu, stiffness, 0, 1).denominator.mid[0]
+    x = 4.0 / loop["omega"]
+    wanted = 1 + loop["spring"] / 1.1 - x**2 + 2j * loop["zeta"] * x
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
 
 
 # --- the return difference ------------------------------------------------------------------------

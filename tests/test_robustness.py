@@ -17,7 +17,7 @@ from jaxmodel.frequency_response import close_loop, command_gain
 from jaxmodel.linear import linearise, resting
 from jaxmodel.loop_figures import MARGINS, MOST_DELAY, PEAKS, guaranteed_range
 from jaxmodel.prepare import prepare
-from jaxmodel.robustness import margin_at, norm_peaks, search_frequencies
+from jaxmodel.robustness import coarse_norm, margin_at, norm_peaks, search_frequencies
 from jaxmodel.sampled_loop import analogue_plant, closed_loop, delayed_loop, delayed_parts
 from jaxmodel.scaling import best_scaling
 from studies.engine import diagonal_scaling
@@ -333,6 +333,15 @@ def smallest_norm(matrix: np.ndarray) -> float:
     return best
 
 
+def test_a_coarse_norm_is_high_by_a_root_of_the_size_at_most():
+    """Sixty-four powers of A'A: the trace has all n singular values, the norm one."""
+    rng = np.random.default_rng(4)
+    for n in range(1, 8):
+        matrix = rng.normal(size=(n, n)) * 10.0**n + 1j * rng.normal(size=(n, n))
+        ratio = coarse_norm(matrix) / np.linalg.norm(matrix, 2)
+        assert 1 - 1e-9 < ratio < n ** (1 / 128) + 1e-9
+
+
 def test_the_scaling_is_the_best_one():
     rng = np.random.default_rng(1)
     for n in (3, 9, 15):
@@ -348,6 +357,24 @@ def test_the_scaling_is_the_best_one():
         assert found.bound * (1 - 1e-9) <= searched[0] <= found.bound * (1 + 1e-4)
         norm = np.linalg.norm(matrix * np.exp(log[0][:, None] - log[0]), 2)
         assert norm == pytest.approx(searched[0], rel=1e-9)
+
+
+def test_the_slope_of_a_bound_where_singular_values_coincide():
+    """Of the best scaling, two of which are then largest, against differences."""
+    scaled = jax.jit(best_scaling)
+    for seed, n in ((8, 3), (5, 4), (4, 6), (7, 6)):
+        rng = np.random.default_rng(seed)
+        matrix = rng.normal(size=(n, n)) * (1 - np.eye(n)) + 0.2 * (seed % 2) * np.eye(n)
+        found, change = scaled(matrix + 0j), rng.normal(size=(n, n))
+        x = np.asarray(found.log_scale)
+        largest = np.linalg.svd(matrix * np.exp(x[:, None] - x))[1][:2]
+        assert largest[1] == pytest.approx(largest[0], rel=1e-6)
+        ends = [float(scaled(matrix + h * change + 0j).bound) for h in (1e-5, -1e-5)]
+        slope = np.real(np.sum(np.conj(found.slope) * change))
+        assert slope == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-3)
+    # sqrt(m12 m21)
+    slope = scaled(np.array([[0, 4.0], [1.0, 0]]) + 0j).slope
+    np.testing.assert_allclose(slope, [[0, 0.25], [1.0, 0]], rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize("law", ["imsc", "lqr"])

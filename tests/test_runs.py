@@ -1,10 +1,15 @@
 """A single run: steps it needs, how it ends, statuses that must not read ok, ratios of its own."""
 
+from functools import partial
+
+import jax
 import numpy as np
 import pytest
 
 from jaxmodel import status
+from jaxmodel.bases import find_bases
 from jaxmodel.mechanisms.prrr.paper import HOME
+from jaxmodel.prepare import _is_too_fast
 from jaxmodel.simulate import _share_on
 from studies import config
 from studies.engine.preflight import check_run
@@ -169,3 +174,17 @@ def test_configure_comes_first(monkeypatch):
     monkeypatch.setattr(config, "_is_configured", False)  # as after an import: see test_config
     with pytest.raises(StudyError, match=r"studies\.configure\(\) must be called first"):
         run_study(short_study())
+
+
+def test_filters_beyond_half_the_sample_rate_are_too_fast_for_a_sampled_loop():
+    study = short_study(**SMALL)
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    corner = 1.01 * np.pi / case.electronics.period
+    fast = case._replace(electronics=case.electronics._replace(antialias=corner))
+
+    @partial(jax.jit, static_argnums=0)
+    def found(structure, case):
+        return _is_too_fast(structure, case, find_bases(structure, case))
+
+    assert not found(structure, case) and found(structure, fast)
+    assert not found(structure._replace(feedback="ideal"), fast)

@@ -21,6 +21,7 @@ from studies.study.files import READY, read_toml
 from studies.study.template import toml_text
 from tests.sweeps import small, small_spec
 
+pytestmark = pytest.mark.timeout(7200)  # the long ones, on a busy machine
 TOP = Path(studies.__file__).parents[1]
 MIB = 2**20
 

@@ -392,6 +392,14 @@ def test_faults_are_named(tune, message):
 
 
 @pytest.mark.parametrize(
+    "name", ["saturated_fraction", "clipped_fraction", "motor_saturated_fraction"]
+)
+def test_shares_of_samples_can_be_limited_only(name):
+    with pytest.raises(StudyError, match=f"{name} moves in steps .* limit it instead"):
+        parse_tuning({**SMALL, "tune": {"free": GAIN, "objective": {name: 1.0}}})
+
+
+@pytest.mark.parametrize(
     ("tail", "weights"),
     [(1.0, [0.25] * 4), (0.0, [1, 0, 0, 0]), (0.5, [0.5, 0.5, 0, 0]), (0.3, [5 / 6, 1 / 6, 0, 0])],
 )
