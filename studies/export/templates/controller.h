@@ -30,7 +30,9 @@
 {% endif %}
  * Start: amplifiers off, {{ name }}_init, then {{ NAME }}_SETTLE_SAMPLES times {{ name }}_step.
  *
- * No allocation, no recursion, no library; all memory is in the two structures below.
+ * No allocation, no recursion, no library; all memory is in the two structures below. So a call may
+ * interrupt one for another instance. If it interrupts one for the same instance, no other memory is
+ * touched, but results mean nothing, and a fault may be lost.
  */
 #ifndef {{ NAME }}_H
 #define {{ NAME }}_H
@@ -87,7 +89,8 @@ typedef struct {
     int fault; /* number of the first faulty sensor, from 1; 0: none */
 } {{ name }}_state;
 
-/* Reset everything, including faults: the state of a machine at rest. */
+/* Reset everything, including faults: the state of a machine at rest. Without it, the results
+ * of {{ name }}_step mean nothing, but no other memory is touched. */
 void {{ name }}_init({{ name }}_state *state);
 
 /* One sample: sensors in, values for the actuators of the next sample out.
