@@ -22,12 +22,13 @@ from studies.export.fixed import FixedPoint, rail_samples
 from studies.export.fixed_blocks import FixedBlocks, design_integers
 from studies.export.floating import respond as respond_floating
 from studies.export.integers import respond
-from tests.exports import KINDS, PAPER, changed, found_and_codes
+from tests.exports import KINDS, PAPER, SINGLE, changed, found_and_codes
 
 DATA = Path(__file__).parent / "data"
 #: Every kind of controller: channels, rivals, blocks that know of limits and those that do not.
 DESIGNS = {
     **KINDS,
+    "feed-through of 12 bits": changed(SINGLE, electronics={"adc_bits": 12}),
     "modified imsc": changed(PAPER, control={"law": "modified_imsc"}),
     "lqg": changed(PAPER, control={"law": "lqg"}),
     "observer": changed(PAPER, control={"law": "observer"}),

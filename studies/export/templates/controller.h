@@ -83,7 +83,7 @@ typedef struct {
     {{ count }} line[{{ NAME }}_N_MODES][2]; /* delay line of the second section */
     {% endif %}
     {% if has_feedthrough %}
-    {{ word }} command[{{ NAME }}_N_CHANNELS]; /* on the actuators now */
+    {{ count }} command[{{ NAME }}_N_CHANNELS]; /* on the actuators now */
     {% endif %}
     int16_t rail[{{ NAME }}_N_CHANNELS]; /* consecutive samples at the top, or minus those at 0 */
     int fault; /* number of the first faulty sensor, from 1; 0: none */
