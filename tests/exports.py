@@ -3,8 +3,10 @@
 import shutil
 import subprocess
 
+import numpy as np
 import pytest
 
+from studies.engine.controller import fixed_controller
 from studies.export.compiler import find_compiler
 from studies.study.spec import paper_study, parse_study
 from studies.study.template import study_template
@@ -48,6 +50,49 @@ SINGLE = {
 DESIGNS = {"paper": PAPER, "tuned": TUNED, "single": SINGLE}
 
 
+def changed(data, **sections):
+    """A design with other values in some sections."""
+    merged = {name: {**data.get(name, {}), **values} for name, values in sections.items()}
+    return {**data, **merged}
+
+
+#: Kinds of controllers: laws, estimators, position gains, feed-through, converters.
+KINDS = {
+    "paper": PAPER,
+    "tuned": TUNED,
+    "feed-through": SINGLE,
+    "difference and position gain": changed(
+        PAPER,
+        electronics={"estimator": "difference"},
+        control={"gain_factor": 0.02, "position_gain": [100.0, 50.0, 0.0]},
+    ),
+    "strain rate feedback": changed(
+        PAPER, control={"law": "srf", "velocity_gain": [0.001] * 3, "gain_factor": 0.5}
+    ),
+    "other converters": changed(
+        PAPER,
+        electronics={
+            "conditioner_bias": 1.234,
+            "adc_bits": 10,
+            "voltage_limit": 30.0,
+            "conditioner_gain": 0.7,
+        },
+    ),
+}
+
+
+def found_and_codes(data, length=500):
+    """A controller with ADC codes around its bias, no matter what plant makes them."""
+    found = fixed_controller(parse_study(data))
+    middle = float(found.controller.adc_bias / found.controller.adc_step)
+    top = float(found.controller.adc_top)
+    rng = np.random.default_rng(0)
+    time = np.arange(length)[:, None, None]
+    phase, frequency = rng.uniform(0, 6, (3, 3)), rng.uniform(0.02, 0.4, (3, 3))
+    wave = middle + 0.2 * top * np.sin(frequency * time + phase) + rng.normal(size=(length, 3, 3))
+    return found, np.clip(np.round(wave), 1, top - 1)
+
+
 def write_study(path, data):
     """A complete study file; path: where."""
     path.write_text(study_template(parse_study(data)))
@@ -62,19 +107,17 @@ def needs_compiler():
     return command
 
 
-def needs_sanitizers(folder):
-    """A compiler that has address and undefined-behaviour sanitizers, with their flags."""
-    command = [*needs_compiler(), "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-    source = folder / "nothing.c"
+def needs_sanitizers(folder, command=(), kinds="address,undefined"):
+    """A compiler's command with sanitizers; skips the test where it has none of these kinds."""
+    command = command or needs_compiler()
+    if not shutil.which(command[0]):
+        pytest.skip(f"no {command[0]} here")
+    command = [*command, f"-fsanitize={kinds}", "-fno-sanitize-recover=all"]
+    source, program = folder / "nothing.c", folder / "nothing"
     source.write_text("int main(void) { return 0; }\n")
-    done = subprocess.run(
-        [*command, "-o", folder / "nothing", source], capture_output=True, timeout=120
-    )
-    if (
-        done.returncode
-        or subprocess.run([folder / "nothing"], capture_output=True, timeout=120).returncode
-    ):
-        pytest.skip("the C compiler here has no address and undefined-behaviour sanitizers")
+    for trial in ([*command, "-o", program, source], [program]):
+        if subprocess.run(trial, capture_output=True, timeout=120).returncode:
+            pytest.skip(f"{command[0]} has no sanitizers {kinds} here")
     return command
 
 

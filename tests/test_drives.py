@@ -16,6 +16,7 @@ from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import closed_loop
 from jaxmodel.simulate import command, simulate
 from studies.errors import StudyError
+from studies.export import c_drive
 from studies.export.c_drive import compare_drive, drive_code
 from studies.export.compiler import find_compiler
 from studies.extensions import extend
@@ -300,6 +301,23 @@ def test_exported_c_of_every_sampled_drive_equals_the_drive_in_jax():
     study = study_of("pd")
     exported = SimpleNamespace(structure=build_structure(study), case=None)
     assert drive_code(exported, "servo", []) is None
+
+
+@pytest.mark.skipif(not find_compiler(), reason="needs a C compiler")
+@pytest.mark.parametrize("name", SAMPLED)
+def test_an_argument_that_is_not_finite_does_not_stay_in_a_drive(name):
+    """Each motor has another argument that is not finite for five samples."""
+    study = study_of(name)
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    exported = SimpleNamespace(structure=structure, case=case)
+    code = drive_code(exported, "servo", ["a test"])
+    signals = np.ones((3, 20, 3)) * np.array([1e-4, 0.01, 10.0])[:, None, None]
+    broken = signals.copy()
+    broken[[0, 1, 2], :5, [0, 1, 2]] = [np.nan, np.inf, -np.inf, np.nan, np.nan]
+    wanted = c_drive._run(code, find_compiler(), np.float64, *signals)
+    found = c_drive._run(code, find_compiler(), np.float64, *broken)
+    assert np.all(wanted != 0) and np.all(found[:5] == 0)
+    np.testing.assert_array_equal(found[5:], wanted[:-5])
 
 
 def test_a_drive_too_stiff_for_its_delay_is_unstable_in_the_loop_that_is_judged():

@@ -30,52 +30,9 @@ from studies.export.integers import respond
 from studies.export.job import check_loop
 from studies.export.verify import reference_run
 from studies.study.spec import parse_study
-from tests.exports import PAPER, SINGLE, TUNED, needs_compiler
+from tests.exports import KINDS, PAPER, SINGLE, TUNED, changed, found_and_codes, needs_compiler
 
 RAIL = 100
-
-
-def changed(data, **sections):
-    """A design with other values in some sections."""
-    merged = {name: {**data.get(name, {}), **values} for name, values in sections.items()}
-    return {**data, **merged}
-
-
-#: Kinds of controllers: laws, estimators, position gains, feed-through, converters.
-KINDS = {
-    "paper": PAPER,
-    "tuned": TUNED,
-    "feed-through": SINGLE,
-    "difference and position gain": changed(
-        PAPER,
-        electronics={"estimator": "difference"},
-        control={"gain_factor": 0.02, "position_gain": [100.0, 50.0, 0.0]},
-    ),
-    "strain rate feedback": changed(
-        PAPER, control={"law": "srf", "velocity_gain": [0.001] * 3, "gain_factor": 0.5}
-    ),
-    "other converters": changed(
-        PAPER,
-        electronics={
-            "conditioner_bias": 1.234,
-            "adc_bits": 10,
-            "voltage_limit": 30.0,
-            "conditioner_gain": 0.7,
-        },
-    ),
-}
-
-
-def found_and_codes(data, length=500):
-    """A controller with ADC codes around its bias, no matter what plant makes them."""
-    found = fixed_controller(parse_study(data))
-    middle = float(found.controller.adc_bias / found.controller.adc_step)
-    top = float(found.controller.adc_top)
-    rng = np.random.default_rng(0)
-    time = np.arange(length)[:, None, None]
-    phase, frequency = rng.uniform(0, 6, (3, 3)), rng.uniform(0.02, 0.4, (3, 3))
-    wave = middle + 0.2 * top * np.sin(frequency * time + phase) + rng.normal(size=(length, 3, 3))
-    return found, np.clip(np.round(wave), 1, top - 1)
 
 
 def checked_design(found, seen, dac_bits, word=32):

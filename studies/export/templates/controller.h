@@ -30,7 +30,9 @@
 {% endif %}
  * Start: amplifiers off, {{ name }}_init, then {{ NAME }}_SETTLE_SAMPLES times {{ name }}_step.
  *
- * No allocation, no recursion, no library; all memory is in the two structures below.
+ * No allocation, no recursion, no library; all memory is in the two structures below. So a call may
+ * interrupt one for another instance. If it interrupts one for the same instance, no other memory is
+ * touched, but results mean nothing, and a fault may be lost.
  */
 #ifndef {{ NAME }}_H
 #define {{ NAME }}_H
@@ -81,13 +83,14 @@ typedef struct {
     {{ count }} line[{{ NAME }}_N_MODES][2]; /* delay line of the second section */
     {% endif %}
     {% if has_feedthrough %}
-    {{ word }} command[{{ NAME }}_N_CHANNELS]; /* on the actuators now */
+    {{ count }} command[{{ NAME }}_N_CHANNELS]; /* on the actuators now */
     {% endif %}
     int16_t rail[{{ NAME }}_N_CHANNELS]; /* consecutive samples at the top, or minus those at 0 */
     int fault; /* number of the first faulty sensor, from 1; 0: none */
 } {{ name }}_state;
 
-/* Reset everything, including faults: the state of a machine at rest. */
+/* Reset everything, including faults: the state of a machine at rest. Without it, the results
+ * of {{ name }}_step mean nothing, but no other memory is touched. */
 void {{ name }}_init({{ name }}_state *state);
 
 /* One sample: sensors in, values for the actuators of the next sample out.

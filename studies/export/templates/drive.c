@@ -1,3 +1,4 @@
+{% import "export/templates/shared.c" as shared with context %}
 /* Drive of the actuated joints, see {{ name }}.h.
  *
 {% for line in origin %}
@@ -7,6 +8,8 @@
 #include "{{ name }}.h"
 
 #include <math.h>
+
+{{ shared.needs_nan() }}
 
 typedef {{ name }}_real real;
 #define R(x) ((real)(x))
@@ -18,6 +21,11 @@ const real {{ NAME }}_LIMIT{{ limit }};
 {% for constant, values in constants %}
 static const real {{ constant }}{{ values }};
 {% endfor %}
+
+static int is_finite(real x)
+{
+    return x - x <= 0;
+}
 
 void {{ name }}_init({{ name }}_state *s)
 {
@@ -45,13 +53,15 @@ void {{ name }}_step({{ name }}_state *s, const real error[{{ n_links }}], const
 {% for line in memory %}
         {{ line }}
 {% endfor %}
+        const int is_good = is_finite(error[i]) && is_finite(error_rate[i]) && is_finite(feedforward[i])
+            && is_finite(force){{ " && is_finite(memory)" if memory }};
 
         (void)applied;
 {% if memory %}
-        s->memory[i] = memory;
+        s->memory[i] = is_good ? memory : R(0.0); /* or it would stay there */
 {% endif %}
-        s->force[i] = force;
-        feedback[i] = force;
+        s->force[i] = is_good ? force : R(0.0);
+        feedback[i] = s->force[i];
     }
     (void)kp;
     (void)kd;

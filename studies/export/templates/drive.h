@@ -36,7 +36,8 @@ typedef struct {
 void {{ name }}_init({{ name }}_state *state);
 
 /* One sample: reference less measured position [m] and speed [m/s] of each slider, and the
- * feed-forward that acts during this sample [N]; returns the feedback of the next one [N]. */
+ * feed-forward that acts during this sample [N]; returns the feedback of the next one [N]. A
+ * motor with an argument that is not finite gets no feedback, and its law begins anew. */
 void {{ name }}_step({{ name }}_state *state, const {{ name }}_real error[{{ n_links }}],
                      const {{ name }}_real error_rate[{{ n_links }}], const {{ name }}_real feedforward[{{ n_links }}],
                      {{ name }}_real feedback[{{ n_links }}]);

@@ -346,7 +346,7 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
         command = within(shifted(sum, SYNTHESIZER_SHIFT[k]));
         {% endif %}
         {% if has_feedthrough %}
-        state->command[k] = command;
+        state->command[k] = ({{ count }})command;
         {% endif %}
         actuator[k] = (uint16_t)(command + DAC_REST);
     }

@@ -11,9 +11,7 @@
  */
 #include "{{ name }}.h"
 
-#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
-#error "compile without -ffast-math and -ffinite-math-only: they leave out the check for NaN"
-#endif
+{{ shared.needs_nan() }}
 
 typedef {{ name }}_real real;
 #define R(x) ((real)(x))

@@ -1,4 +1,10 @@
 {# Pieces that floating and fixed point have in common. #}
+{% macro needs_nan() %}
+#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
+#error "compile without -ffast-math and -ffinite-math-only: they leave out the check for NaN"
+#endif
+{%- endmacro %}
+
 {% macro structure() %}
 /* 1: link is controlled; control.links */
 static const uint16_t IS_USED{{ array(is_used) }};
