@@ -257,14 +257,15 @@ def test_a_steady_load_is_held_and_a_pulse_moves_the_platform():
 # --- axial compliance -----------------------------------------------------------------------------
 
 
-def test_stretch_error_is_the_geometry_of_longer_links():
+@pytest.mark.parametrize("pose", [HOME_POSE, HOME_POSE + np.array([0.006, -0.004, 0.03])])
+def test_stretch_error_is_the_geometry_of_longer_links(pose):
     plant = plant_of(*arrays(BARE))
     stretch = 1e-6 * np.array([3.0, -2.0, 1.0])
     still = np.zeros(3)
-    chain = close_chain(plant, HOME_POSE, still)
+    chain = close_chain(plant, pose, still)
     found = np.asarray(axial.stretch_error(chain, stretch))
     longer = plant._replace(length=plant.length + stretch)
-    moved = close_chain(longer, HOME_POSE + found, still)
+    moved = close_chain(longer, pose + found, still)
     np.testing.assert_allclose(moved.rho, chain.rho, atol=1e-10)  # the sliders stay
     np.testing.assert_allclose(axial.axial_compliance(arrays(BARE)[1].machine), 0.2 / 1.4e6)
 

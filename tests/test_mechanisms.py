@@ -10,11 +10,14 @@ from jaxmodel import kinematics, status
 from jaxmodel.case import uncontrolled
 from jaxmodel.frequency_response import plant_response
 from jaxmodel.linear import linearise
+from jaxmodel.mechanisms import MECHANISMS
+from jaxmodel.mechanisms.contract import check_mechanism
 from jaxmodel.mechanisms.five_bar.cranks import FiveBarGeometry
 from jaxmodel.mechanisms.prrr.paper import paper_machine
 from jaxmodel.mechanisms.rrr.cranks import CrankGeometry
 from jaxmodel.prepare import prepare
 from jaxmodel.simulate import simulate
+from jaxmodel.table import PartError
 from studies.engine.runs import run_study
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
@@ -248,3 +251,17 @@ def test_kernel_equals_scan_on_cranks():
 def test_bad_mechanisms_are_refused(machine, message):
     with pytest.raises(StudyError, match=message):
         parse_study({"machine": machine})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"build": 3}, "mechanism 'x': build = 3; expected a function"),
+        ({"n_links": 2}, "mechanism 'x': n_links = 2, n_pose = 3; allowed: 3 and 3, or 2 and 2"),
+        ({"home": (0.0, 0.0)}, "mechanism 'x': home = .*; expected 3 numbers"),
+    ],
+)
+def test_descriptions_of_mechanisms_are_checked(change, message):
+    check_mechanism(MECHANISMS["rrr"])
+    with pytest.raises(PartError, match=message):
+        check_mechanism(MECHANISMS["rrr"]._replace(name="x", **change))

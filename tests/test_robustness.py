@@ -17,7 +17,7 @@ from jaxmodel.frequency_response import close_loop, command_gain
 from jaxmodel.linear import linearise, resting
 from jaxmodel.loop_figures import MARGINS, MOST_DELAY, PEAKS, guaranteed_range
 from jaxmodel.prepare import prepare
-from jaxmodel.robustness import coarse_norm, margin_at, norm_peaks, search_frequencies
+from jaxmodel.robustness import _refined, coarse_norm, margin_at, norm_peaks, search_frequencies
 from jaxmodel.sampled_loop import analogue_plant, closed_loop, delayed_loop, delayed_parts
 from jaxmodel.scaling import best_scaling
 from studies.engine import diagonal_scaling
@@ -331,6 +331,14 @@ def smallest_norm(matrix: np.ndarray) -> float:
         x = np.append(y, 0.0)
         best = min(best, np.linalg.norm(matrix * np.exp(x[:, None] - x), 2))
     return best
+
+
+def test_a_peak_between_points_is_found_with_its_height():
+    """Of a parabola; the height at the nearest point of an interval that is halved three times."""
+    place, height = _refined(lambda w: 3 - (w - 1.23) ** 2, jnp.linspace(0, 5, 11), 3)
+    assert float(place) == pytest.approx(1.23, abs=1e-9)
+    spacing = 1.0 / 4 / 2**3
+    assert 3 - (spacing / 2) ** 2 <= float(height) <= 3
 
 
 def test_a_coarse_norm_is_high_by_a_root_of_the_size_at_most():
