@@ -40,7 +40,9 @@ static wire of_code(int32_t code)
 #ifdef FIXED
     return (wire)code;
 #else
-    return (wire)(code * FLEXLINK_ADC_STEP);
+    const wire denormal = (wire)(sizeof(wire) == 8 ? 1e-310 : 1e-40);
+
+    return code > 0 ? (wire)(code * FLEXLINK_ADC_STEP) : denormal; /* stands for 0 as well as 0 does */
 #endif
 }
 
