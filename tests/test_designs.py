@@ -1,5 +1,6 @@
 """`studies screen`: tallies, designs made shard by shard, and going on after interruptions."""
 
+import re
 import threading
 
 import numpy as np
@@ -108,6 +109,8 @@ def test_quantiles_are_exact_within_one_per_cent():
         assert counts.sum() == len(chosen)
         assert abs(quantile(counts, 0.5) / exact - 1) <= 0.0101
     assert np.isnan(quantile(np.zeros(10, int), 0.5))
+    zeros = tally_of(row, code, 0 * value, columns, axes, 10, False)
+    assert quantile(zeros.sketch[0], 0.5) == 0
 
 
 # --- designs --------------------------------------------------------------------------------------
@@ -299,6 +302,62 @@ def test_what_a_screen_cannot_do_is_refused():
         screen_of(SPEC, by="structural_rms[link=4]")
     with pytest.raises(StudyError, match="--keep = 0"):
         screen_of(SPEC, keep=0)
+
+
+def test_slow_axes_of_a_grid_are_seen():
+    gains = {"from": 0.1, "to": 5.0, "count": 100}
+    inner = {f"control.velocity_gain[{k}]": gains for k in range(2)}
+    grid = {"method": "grid", "axes": {"control.modes": [2, 1]} | inner}
+    screen = screen_of(small_spec(grid | {"where": "control.velocity_gain[0] > 4"}))
+    assert screen.axes.names == ("control.modes", *inner)
+    assert [len(centers) for centers in screen.axes.centers] == [2, 18, 20]  # 18 above 4
+    assert screen.axes.centers[0].tolist() == [1, 2] and screen.axes.bounds[0].tolist() == [1.5]
+    screen_of(small_spec(grid), by="residual_modal_rms[mode=2]")
+
+
+def test_grids_inside_random_points_are_seen():
+    gains = {"from": 0.1, "to": 5.0, "count": 5000}
+    block = {"method": "grid", "axes": {"control.velocity_gain[0]": gains}}
+    sweep = {"method": "random", "count": 10**8, "axes": {"load.mass": {"from": 0.1, "to": 0.2}}}
+    axes = screen_of(small_spec(sweep | {"blocks": [block]})).axes
+    assert axes.names == ("load.mass", "control.velocity_gain[0]")
+    assert [len(centers) for centers in axes.centers] == [20, 20]
+
+
+def test_too_many_designs_are_refused_before_any_runs():
+    fine = {"from": 0.1, "to": 0.2, "count": 10**5}
+    grid = {f"control.velocity_gain[{k}]": fine for k in range(3)}
+    with pytest.raises(StudyError, match=r"1e\+15 designs; allowed: up to 1e\+12"):
+        screen_of(small_spec({"method": "grid", "axes": grid}))
+    with pytest.raises(StudyError, match="sweep.count = 1073741825; allowed: up to 1073741824"):
+        screen_of(small_spec({"method": "sobol", "count": 2**30 + 1, "axes": AXES}))
+
+
+def test_report_of_axes_of_text(tmp_path):
+    spec = small_spec({"method": "grid", "axes": {"shaper.kind": ["none", "zv"]}})
+    done = screened(tmp_path, spec)
+    write_screen_report(tmp_path, done)
+    tally, text = done.tally, text_of((tmp_path / "report.html").read_text())
+    kind = ("none", "zv")[tally.row[0]]
+    assert re.search(
+        rf"\| shaper\.kind \|.*\| {tally.row[0]} \|[^\n]*\| {kind} \|", text, re.DOTALL
+    )
+    assert not (tmp_path / "influence.png").exists()
+
+
+def test_nothing_is_kept_where_no_design_ends_well(tmp_path, capsys):
+    from studies.study.template import toml_text
+
+    file, out = tmp_path / "sweep.toml", tmp_path / "out"
+    gain = {"from": 500.0, "to": 1000.0}
+    file.write_text(toml_text(small(SWEEP | {"count": 20, "where": "", "axes": {"gain": gain}})))
+    main(["screen", str(file), "--out", str(out)])
+    text = capsys.readouterr().out
+    assert "no design ended well; nothing is kept" in text and BEST not in text
+    assert BEST not in text_of((out / "report.html").read_text())
+    assert sorted(path.name for path in out.iterdir() if path.suffix) == sorted(
+        ["report.html", "screen.json", TALLY]
+    )
 
 
 def test_report_says_what_was_found(whole):

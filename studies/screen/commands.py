@@ -90,9 +90,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if not quiet:
             for line in summary_lines(done):
                 console.print(line, soft_wrap=True)
-            console.print(
-                f"the full model of the best: studies sweep {out / BEST} --out DIR", soft_wrap=True
-            )
+            if len(done.tally.row):
+                console.print(
+                    f"the full model of the best: studies sweep {out / BEST} --out DIR",
+                    soft_wrap=True,
+                )
             announce(console, out / REPORT)
         if done.lost:
             print(

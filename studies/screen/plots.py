@@ -42,22 +42,19 @@ def influence(done: ScreenOutcome) -> Figure:
     unit = METRICS[screen.metric].unit
     factor = readable(unit)[0]
     is_largest = screen.ranking[1]
-    count = max(len(screen.axes.names), 1)
+    count = len(screen.axes.names)
     figure, axes = figures.new_figure(-(-count // ACROSS), min(count, ACROSS), 1.9, False)
     panels = list(axes.flat)
     for ax in panels[len(screen.axes.names) :]:
         ax.set_visible(False)
     for k, (ax, name) in enumerate(zip(panels, screen.axes.names, strict=False)):
         part = done.tally.sketch[screen.axes.part(k)]
-        low, high = screen.axes.ends[k]
-        edges = np.concatenate([[low], screen.axes.bounds[k], [high]])
-        middle = (edges[1:] + edges[:-1]) / 2
         for (share, text), color in zip(CURVES, figures.SERIES, strict=False):
             at = 1 - share if is_largest else share
             curve = [factor * quantile(counts, at) for counts in part]
-            ax.plot(middle, curve, color=color, lw=1.2, label=text)
+            ax.plot(screen.axes.centers[k], curve, color=color, lw=1.2, label=text)
         own = field_unit(name.partition("[")[0])
-        ax.set_xlabel(name if own == "1" else f"{name} [{own}]")
+        ax.set_xlabel(name if own == "1" else f"{name}\n[{own}]")
         figures.log_scale(ax, "y")
     panels[0].set_ylabel(headed(screen.entry, unit))
     figures.legend_above(figure, panels[0])

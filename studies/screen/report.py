@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
 from studies.publish import REPORT, publish
 from studies.screen.plots import influence, values
 from studies.screen.run import ScreenOutcome
+from studies.screen.shards import axis_numbers
 from studies.screen.stored import BEST
 from studies.screen.tally import LEFT_OUT, quantile
 from studies.show.figures import styled
@@ -95,12 +98,16 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
         StudyError: a file cannot be written.
     """
     screen, tally = done.screen, done.tally
-    drawings = {VALUES: values, INFLUENCE: influence}
-    with publish(folder, stale=drawings) as staging:
-        if len(tally.row):
-            with styled():
-                for name, draw in drawings.items():
-                    save_plot(draw(done), staging / name)
+    drawings: dict[str, Callable[[ScreenOutcome], Figure]] = {}
+    if len(tally.row):
+        drawings[VALUES] = values
+    if len(tally.row) and screen.axes.names:
+        drawings[INFLUENCE] = influence
+    texts, rows = _best_rows(done) if len(tally.row) else ([], [])
+    with publish(folder, stale=(VALUES, INFLUENCE)) as staging:
+        with styled():
+            for name, draw in drawings.items():
+                save_plot(draw(done), staging / name)
         text = page(
             "screen/report.html",
             staging,
@@ -111,34 +118,36 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
             best=BEST,
             screen=screen,
             summary=summary_lines(done),
-            drawn=list(drawings) if len(tally.row) else [],
+            drawn=list(drawings),
             endings=ending_rows(done),
             quantiles=quantile_rows(done),
             heads=(
                 "design",
                 headed(screen.entry, unit_of(done)),
                 "gain margin",
+                *texts,
                 *screen.axes.names,
             ),
-            rows=_best_rows(done),
+            rows=rows,
             lost=done.lost,
         )
         (staging / REPORT).write_text(text, encoding="utf-8")
 
 
-def _best_rows(done: ScreenOutcome) -> list[tuple[str, ...]]:
-    from studies.screen.shards import axis_numbers
-
+def _best_rows(done: ScreenOutcome) -> tuple[list[str], list[tuple[str, ...]]]:
+    """Names of the columns of text, such as the kind of the shaper; rows of the best designs."""
     rows = done.tally.row[:SHOWN]
     table = build_table(done.screen.spec, np.sort(rows))
+    texts = {name: column for name, column in table.fields.items() if column.dtype.kind == "U"}
     place = {int(row): k for k, row in enumerate(table.row)}
     numbers = axis_numbers(table)
     factor = readable(unit_of(done))[0]
-    return [
+    return list(texts), [
         (
             str(row),
             f"{factor * value:.4g}",
             margin_text(margin),
+            *(str(column[place[row]]) for column in texts.values()),
             *(f"{numbers[name][place[row]]:.4g}" for name in done.screen.axes.names),
         )
         for row, value, margin in zip(

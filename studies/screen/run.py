@@ -144,7 +144,7 @@ def run_screen(
         phases: of a longer command, with those of `PHASES`, in place of is_quiet.
 
     Returns:
-        ScreenOutcome; `best.toml` is there unless the run was interrupted.
+        ScreenOutcome; `best.toml` is there unless the run was interrupted or no design ended well.
 
     Raises:
         StudyError: a fault of the sweep, the folder or the disk. Finished shards stay.
@@ -169,7 +169,7 @@ def run_screen(
             is_done[shard] = True
             write_tally(out, screen, is_done, tally)
         is_interrupted = stop.is_set() and not is_done.all()
-        if not is_interrupted:
+        if not is_interrupted and len(tally.row):
             write_best(out, screen, tally)
     margin = np.full(len(tally.row), np.nan)
     if not is_interrupted:

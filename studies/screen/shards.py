@@ -19,7 +19,7 @@ from studies.engine.stored import chunk_arrays
 from studies.errors import StudyError, field_error
 from studies.screen.tally import Axes, Tally, divided, merged, nothing, only_left_out, tally_of
 from studies.space.axes import LIMIT
-from studies.space.designs import design_of
+from studies.space.designs import LazyCases, design_of
 from studies.space.methods import METHODS
 from studies.space.spec import SweepSpec
 from studies.space.table import CaseTable, as_numbers, build_table
@@ -31,7 +31,9 @@ SHARD = 2**18
 #: Designs side by side: preparing many at once is faster, and the linear model needs little memory.
 LANES = 512
 #: Designs by whose values axes are divided.
-FIRST = 2**12
+TRIED = 2**12
+#: Most designs.
+MOST = 10**12
 
 
 class ScreenRequest(NamedTuple):
@@ -102,10 +104,16 @@ def screen_of(
             raise field_error(f"sweep.{name}", value, f"{default!r} in a screen")
     if not 1 <= keep <= LIMIT:
         raise field_error("--keep", keep, f"1 to {LIMIT} designs")
-    n_designs = design_of(spec.root, spec.study, spec.sweep.seed).size
-    table = build_table(spec, np.arange(min(n_designs, FIRST)))
+    design = design_of(spec.root, spec.study, spec.sweep.seed)
+    if design.size > MOST:
+        raise StudyError(f"sweep: {design.size:.3g} designs; allowed: up to {MOST:.0e} in a screen")
+    tried = _tried(design)
+    table = build_table(spec, tried)
     if not len(table):
-        raise StudyError(f"sweep.where = {spec.sweep.where!r}: true for none of the first {FIRST}")
+        raise StudyError(
+            f"sweep.where = {spec.sweep.where!r}: true for none of {len(tried)} designs tried; "
+            "narrow the axes to where it holds"
+        )
     sizes = entry_sizes(spec.study) | {
         "mode": int(table.values("link.modes").max()),
         "controlled_mode": int(table.values("control.modes").max()),
@@ -115,10 +123,17 @@ def screen_of(
         spec=spec,
         by=by,
         keep=keep,
-        n_designs=n_designs,
+        n_designs=design.size,
         axes=divided(_distinct(axis_numbers(table))),
         shard_size=shard_size or SHARD,
     )
+
+
+def _tried(design: LazyCases) -> np.ndarray:
+    """Numbers of some designs in which every axis varies, the same in any process, (n,)."""
+    if design.size <= TRIED:
+        return np.arange(design.size)
+    return np.unique(design.some(np.random.default_rng(0), TRIED))
 
 
 def _distinct(columns: Columns) -> Columns:

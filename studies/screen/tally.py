@@ -16,7 +16,7 @@ from studies.study.fields import Columns
 #: Values between two bounds of a sketch count as one: bounds are apart by this factor, so that
 #: quantiles are exact within 1 %.
 GROWTH = 1.02
-#: Values below count as this one, and those above `BUCKETS` factors more as that.
+#: Values below count as 0, and those above `BUCKETS` factors more as that.
 LEAST = 1e-15
 #: Of a sketch: up to 1e9.
 BUCKETS = 2800
@@ -46,7 +46,7 @@ class Axes(NamedTuple):
 
     names: tuple[str, ...]
     bounds: tuple[np.ndarray, ...]  # between the intervals, ascending, (intervals - 1,)
-    ends: np.ndarray  # least and largest value, (axes, 2)
+    centers: tuple[np.ndarray, ...]  # where the intervals are drawn, (intervals,)
 
     @property
     def n_sketches(self) -> int:
@@ -65,16 +65,21 @@ def divided(columns: Columns) -> Axes:
     Args:
         columns: numbers of every axis, from `axis_numbers`.
     """
-    bounds = []
+    bounds, centers = [], []
     for x in columns.values():
         distinct = np.unique(x)
         if len(distinct) > INTERVALS:
-            distinct = np.unique(np.quantile(x, np.linspace(0, 1, INTERVALS + 1)))[1:-1]
-            bounds.append(distinct)
+            edges = np.unique(np.quantile(x, np.linspace(0, 1, INTERVALS + 1)))
+            bounds.append(edges[1:-1])
+            centers.append(_between(edges))
         else:
-            bounds.append((distinct[1:] + distinct[:-1]) / 2)
-    ends = np.array([[x.min(), x.max()] for x in columns.values()]).reshape(-1, 2)
-    return Axes(tuple(columns), tuple(bounds), ends)
+            bounds.append(_between(distinct))
+            centers.append(distinct)
+    return Axes(tuple(columns), tuple(bounds), tuple(centers))
+
+
+def _between(x: np.ndarray) -> np.ndarray:
+    return np.asarray((x[1:] + x[:-1]) / 2)
 
 
 def nothing(axes: Axes) -> Tally:
@@ -150,7 +155,7 @@ def _best(row: np.ndarray, value: np.ndarray, keep: int, is_largest: bool) -> np
 
 
 def quantile(sketch: np.ndarray, share: float) -> float:
-    """A quantile of the values in a sketch, exact within 1 %; NaN without any.
+    """A quantile of the values in a sketch, exact within 1 %; 0 below `LEAST`, NaN without any.
 
     Args:
         sketch: numbers of values, (BUCKETS,).
@@ -160,4 +165,4 @@ def quantile(sketch: np.ndarray, share: float) -> float:
     if not total:
         return float("nan")
     bucket = np.searchsorted(np.cumsum(sketch), share * total, side="left")
-    return float(LEAST * GROWTH ** (min(bucket, BUCKETS - 1) + 0.5))
+    return float(LEAST * GROWTH ** (min(bucket, BUCKETS - 1) + 0.5)) if bucket else 0.0

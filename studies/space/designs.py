@@ -20,6 +20,9 @@ from studies.study.fields import Columns
 from studies.study.paths import checked_value, known_field
 from studies.study.spec import Study
 
+#: Points of a sampled block that stand for all of them: the first ones, which are quick to make.
+EARLY = 2**12
+
 
 class LazyCases(NamedTuple):
     """Cases as they are written, made only when they are asked for."""
@@ -27,6 +30,8 @@ class LazyCases(NamedTuple):
     names: tuple[str, ...]  # of the columns
     size: int
     rows: Callable[[np.ndarray], Columns]  # of these numbers, from 0, ascending, (n,)
+    # so many numbers at random that are quick to make together
+    some: Callable[[np.random.Generator, int], np.ndarray]
 
 
 def design_of(node: BlockNode, study: Study, seed: int, stride: int = 1000) -> LazyCases:
@@ -63,7 +68,13 @@ def _stored(columns: Columns) -> LazyCases:
         tuple(columns),
         length(columns),
         lambda rows: {name: column[rows] for name, column in columns.items()},
+        _anywhere(length(columns)),
     )
+
+
+def _anywhere(size: int) -> Callable[[np.random.Generator, int], np.ndarray]:
+    """Numbers below a size, each as likely as another."""
+    return lambda rng, count: rng.integers(size, size=count)
 
 
 def _axes(node: BlockNode, study: Study) -> dict[str, Axis]:
@@ -109,6 +120,7 @@ def _zipped(parts: list[LazyCases], path: str) -> LazyCases:
         _names(parts),
         sizes[0] if sizes else 1,
         lambda rows: {name: x for part in parts for name, x in part.rows(rows).items()},
+        _anywhere(min(sizes[0] if sizes else 1, LIMIT)),
     )
 
 
@@ -123,7 +135,13 @@ def _product(parts: list[LazyCases]) -> LazyCases:
             result |= _some(part, rows // inner % part.size)
         return result
 
-    return LazyCases(_names(parts), math.prod(part.size for part in parts), rows_of)
+    def some(rng: np.random.Generator, count: int) -> np.ndarray:
+        rows = np.zeros(count, np.int64)
+        for part in parts:
+            rows = rows * part.size + part.some(rng, count)
+        return rows
+
+    return LazyCases(_names(parts), math.prod(part.size for part in parts), rows_of, some)
 
 
 def _some(part: LazyCases, rows: np.ndarray) -> Columns:
@@ -179,7 +197,7 @@ def _sampled(node: BlockNode, study: Study, seed: int) -> LazyCases:
     names = tuple(at(np.full((1, dimensions), 0.5)))
     if not method.is_streamed:
         every = unit_points(node, dimensions, seed)
-        return LazyCases(names, len(every), lambda rows: at(every[rows]))
+        return LazyCases(names, len(every), lambda rows: at(every[rows]), _anywhere(len(every)))
 
     def rows_of(rows: np.ndarray) -> Columns:
         first, stop = int(rows[0]), int(rows[-1]) + 1
@@ -190,7 +208,7 @@ def _sampled(node: BlockNode, study: Study, seed: int) -> LazyCases:
             )
         return at(unit_points(node, dimensions, seed, (first, stop))[rows - first])
 
-    return LazyCases(names, node.block.count, rows_of)
+    return LazyCases(names, node.block.count, rows_of, _anywhere(min(node.block.count, EARLY)))
 
 
 def unit_points(

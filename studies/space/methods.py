@@ -112,9 +112,12 @@ def sobol_points(request: SamplingRequest) -> np.ndarray:
         raise field_error(
             f"{request.path}.axes", request.dimensions, "up to 21201 dimensions for Sobol points"
         )
-    if request.stop > LONGEST_SEQUENCE:
+    if request.block.count > LONGEST_SEQUENCE:
         raise field_error(
-            f"{request.path}.count", request.stop, f"up to {LONGEST_SEQUENCE} Sobol points", "1"
+            f"{request.path}.count",
+            request.block.count,
+            f"up to {LONGEST_SEQUENCE} Sobol points",
+            "1",
         )
     sequence = _sequence(request.dimensions, request.seed)
     with sequence.lock:
