@@ -295,7 +295,7 @@ def test_a_comparison_writes_a_page_whose_order_is_that_of_the_runs(tmp_path, mo
     [
         ({"design": 3}, "law 'x': design = 3; expected a function"),
         ({"channel": "link"}, "law 'x': channel = 'link'; allowed: 'mode', 'patch' or 'none'"),
-        ({"parameters": "a"}, "expected a Parameter"),
+        ({"parameters": "a"}, "expected a tuple of Parameter"),
     ],
 )
 def test_descriptions_of_laws_are_checked(change, message):
