@@ -382,6 +382,7 @@ COMMANDS = {
     "sweep, empty cache": ("sweep", "../../sweep.toml", *ON),
     "sweep, local workers": ("sweep", "../../longer.toml", *ON, "--local-workers", "2"),
     "extension": ("sweep", "../../longer.toml", *ON),
+    "screened sweep": ("sweep", "../../screened.toml", *ON),
     "screen": ("screen", "../../many.toml", "--keep", "20", *ON),
     "tune": ("tune", "../../tune.toml", *ON),
     "atlas": ("atlas", "../../study.toml", *ON),
@@ -396,8 +397,8 @@ COMMANDS = {
     "twin": ("twin", "../../study.toml", *OUT),
     "verify": ("verify", "../../study.toml", "--json"),
 }
-#: Axes of a screen.
-GAINS = {"gain": {"from": 0.1, "to": 1.0}, "emc_exponent": {"from": 0.0, "to": 1.0}}
+#: Designs to choose from.
+RANDOM = {"method": "random", "axes": {"gain": {"from": 0.1, "to": 1.0}, "placement": {}}}
 #: Those that begin in the folder of a finished sweep.
 AFTER_SWEEP = ("extension", "plot", "explore")
 COMMISSION = Command("commission", ("commission", "../../commission.toml", *ON))
@@ -414,7 +415,8 @@ def write_files(folder):
     files = {
         "sweep": small(),
         "longer": small(more),
-        "many": small({"method": "random", "count": 1000, "axes": GAINS}),
+        "screened": small({**RANDOM, "count": 96, "screen": {"keep": 0.25}}),
+        "many": small({**RANDOM, "count": 1000}),
         "stiffer": small(more, drive={"kp": 4e4}),
         "tune": SMALL | {"tune": {"free": GAIN, "starts": 3, "iterations": 6}},
         "fit": fit,

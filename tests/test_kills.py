@@ -11,6 +11,7 @@ COUNTS = {
     "extension": 8,
     "sweep, empty cache": 3,
     "sweep, local workers": 5,
+    "screened sweep": 6,
     "screen": 8,
     "tune": 8,
     "fit": 5,

@@ -136,7 +136,7 @@ def test_a_mutant_is_judged_by_tests_that_execute_its_statement():
 
 def test_mutants_in_short(tmp_path):
     """Of one module, judged by its own tests."""
-    found = campaign(tmp_path, ["test_controller.py"], 100, "--of", "controller.py", limit=240)
+    found = campaign(tmp_path, ["test_controller.py"], 200, "--of", "controller.py", limit=240)
     assert len(found) >= 2
 
 

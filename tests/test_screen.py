@@ -22,7 +22,7 @@ from studies.sweeps.show import ranked_cases, recommended
 from tests.pages import text_of
 from tests.sweeps import HOME_PHI, small, small_spec
 from tests.test_kernel import ALL_SORTS, check_equal
-from tests.test_sweeps import killed_until_done, partly_done
+from tests.test_sweeps import partly_done
 
 jax = pytest.importorskip("jax")
 HOME = (0.0, 0.0, HOME_PHI)
@@ -292,18 +292,6 @@ def test_an_interrupted_screen_goes_on_where_it_was(tmp_path, folders, monkeypat
         np.testing.assert_allclose(found[name], whole[name], rtol=1e-12)
     assert not (out / "chunks").exists() and not (out / "screen").exists()
     assert run(spec, out, is_resumed=True).n_run == 0
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("seed", range(4))
-def test_a_killed_screen_ends_like_any_other(tmp_path, folders, seed):
-    data = small(SWEEP | {"screen": SCREEN})
-    killed_until_done(data, tmp_path / "s", 4, seed)
-    run(screened(), tmp_path / "s", is_resumed=True)
-    whole, found = read(folders / "screened"), read(tmp_path / "s")
-    np.testing.assert_array_equal(found["status"], whole["status"])
-    for name in ("residual_rms", "gain_margin", "screen_value"):
-        np.testing.assert_allclose(found[name], whole[name], rtol=1e-12)
 
 
 def test_a_screened_sweep_can_be_extended(tmp_path):
