@@ -11,7 +11,7 @@ from jaxmodel.case import uncontrolled
 from jaxmodel.frequency_response import plant_response
 from jaxmodel.linear import linearise
 from jaxmodel.mechanisms import MECHANISMS
-from jaxmodel.mechanisms.contract import check_mechanism
+from jaxmodel.mechanisms.check import check_mechanism
 from jaxmodel.mechanisms.five_bar.cranks import FiveBarGeometry
 from jaxmodel.mechanisms.prrr.paper import paper_machine
 from jaxmodel.mechanisms.rrr.cranks import CrankGeometry
@@ -258,7 +258,7 @@ def test_bad_mechanisms_are_refused(machine, message):
     [
         ({"build": 3}, "mechanism 'x': build = 3; expected a function"),
         ({"n_links": 2}, "mechanism 'x': n_links = 2, n_pose = 3; allowed: 3 and 3, or 2 and 2"),
-        ({"home": (0.0, 0.0)}, "mechanism 'x': home = .*; expected 3 numbers"),
+        ({"home": (0.0, 0.0)}, "mechanism 'x': home = .*; expected 3 finite numbers"),
     ],
 )
 def test_descriptions_of_mechanisms_are_checked(change, message):
