@@ -79,11 +79,14 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             if not done.is_interrupted:
                 phases.begin("report")
                 write_screen_report(out, done)
-        again = f"studies screen {spec} --out {out} --resume{workers.options}"
+        again = (
+            f"studies screen {spec} --out {out} --by={asked.by} --keep {keep} --fidelity {fidelity} "
+            f"--precision {precision} --resume{workers.options}"
+        )
         if done.is_interrupted:
             print(
                 f"studies: interrupted; {done.tally.n_designs} of {asked.n_designs} designs are "
-                f"safe; continue with the same options and --resume: {again}",
+                f"safe; continue with: {again}",
                 file=sys.stderr,
             )
             sys.exit(130)
