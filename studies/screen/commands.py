@@ -79,10 +79,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             if not done.is_interrupted:
                 phases.begin("report")
                 write_screen_report(out, done)
-        again = (
-            f"studies screen {spec} --out {out} --by={asked.by} --keep {keep} --fidelity {fidelity} "
-            f"--precision {precision} --resume{workers.options}"
-        )
+        asks = f"--by={asked.by} --keep {keep} --fidelity {fidelity} --precision {precision}"
+        again = f"studies screen {spec} --out {out} {asks} --resume{workers.options}"
         if done.is_interrupted:
             print(
                 f"studies: interrupted; {done.tally.n_designs} of {asked.n_designs} designs are "
