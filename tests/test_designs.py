@@ -137,6 +137,10 @@ def test_a_billion_designs_are_made_anywhere():
     rows = np.arange(10**12 - 100, 10**12)
     table = build_table(small_spec(sweep), rows)
     assert len(table) == 100
+    ends = np.array([7, 10**6, 10**12 - 1])  # as far apart as the best ones may be
+    scattered = build_table(small_spec(sweep), ends)
+    np.testing.assert_array_equal(scattered.row, ends)
+    assert scattered.case_id[-1] == table.case_id[-1]
     with pytest.raises(StudyError, match=r"1e\+12 cases; allowed: up to 10000000. studies screen"):
         build_table(small_spec(sweep))
     with pytest.raises(StudyError, match="up to 1073741824 Sobol points"):

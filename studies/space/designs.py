@@ -21,6 +21,7 @@ from studies.study.paths import checked_value, known_field
 from studies.study.spec import Study
 
 #: Points of a sampled block that stand for all of them: the first ones, which are quick to make.
+#: Rows further apart than that are made without those between them.
 EARLY = 2**12
 
 
@@ -200,13 +201,17 @@ def _sampled(node: BlockNode, study: Study, seed: int) -> LazyCases:
         return LazyCases(names, len(every), lambda rows: at(every[rows]), _anywhere(len(every)))
 
     def rows_of(rows: np.ndarray) -> Columns:
-        first, stop = int(rows[0]), int(rows[-1]) + 1
-        if stop - first > LIMIT:
+        pieces = np.split(rows, np.flatnonzero(np.diff(rows) > EARLY) + 1)
+        if max(piece[-1] - piece[0] for piece in pieces) >= LIMIT:
             raise StudyError(
-                f"{node.path}: {stop - first} points at once; allowed: up to {LIMIT}. Let the "
-                "block with the most points be the outermost one"
+                f"{node.path}: more than {LIMIT} points at once; let the block with the most "
+                "points be the outermost one"
             )
-        return at(unit_points(node, dimensions, seed, (first, stop))[rows - first])
+        points = []
+        for piece in pieces:
+            span = int(piece[0]), int(piece[-1]) + 1
+            points.append(unit_points(node, dimensions, seed, span)[piece - piece[0]])
+        return at(np.concatenate(points))
 
     return LazyCases(names, node.block.count, rows_of, _anywhere(min(node.block.count, EARLY)))
 

@@ -89,8 +89,6 @@ def random_points(request: SamplingRequest) -> np.ndarray:
 
 def hypercube_points(request: SamplingRequest) -> np.ndarray:
     """One Latin hypercube of `size` points after the other."""
-    from scipy.stats import qmc
-
     size = request.block.size or request.block.count
     if size > LARGEST_CUBE:
         raise field_error(
@@ -98,12 +96,19 @@ def hypercube_points(request: SamplingRequest) -> np.ndarray:
         )
     begins = request.first // size
     parts = [
-        qmc.LatinHypercube(request.dimensions, rng=np.random.default_rng([request.seed, k])).random(
-            size
-        )
+        _cube(size, request.dimensions, request.seed, k)
         for k in range(begins, -(-request.stop // size))
     ]
     return np.concatenate(parts)[request.first - begins * size : request.stop - begins * size]
+
+
+@lru_cache(maxsize=1)
+def _cube(size: int, dimensions: int, seed: int, k: int) -> np.ndarray:
+    """A Latin hypercube, kept for those who want it in parts."""
+    from scipy.stats import qmc
+
+    engine = qmc.LatinHypercube(dimensions, rng=np.random.default_rng([seed, k]))
+    return np.asarray(engine.random(size))
 
 
 def sobol_points(request: SamplingRequest) -> np.ndarray:
