@@ -25,8 +25,9 @@ REPORT = "report.html"
 EXPLORER = "explorer.html"
 #: Name prefix of the folders in which files are prepared.
 _STAGED = ".unfinished-"
-#: End of the name under which a file is written: the process, and what tells its files apart.
-_TEMPORARY = re.compile(r"(\d+)-[0-9a-f]{8}\.tmp")
+#: End of the name under which a file is written: the process (older ones had none), and what tells
+#: its files apart.
+TEMPORARY = r"(?:(\d+)-)?[0-9a-f]{8}\.tmp"
 #: What says that a folder is whole moves there last: its page, then its document.
 _LAST = (".html", ".json")
 
@@ -77,8 +78,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
     temporary = target.with_name(f"{start}{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
         for left in target.parent.glob(f"{glob.escape(start)}*.tmp"):
-            owner = _TEMPORARY.fullmatch(left.name.removeprefix(start))
-            if owner and not _is_alive(owner[1]):
+            name = re.fullmatch(TEMPORARY, left.name.removeprefix(start))
+            if name and name[1] and not _is_alive(name[1]):
                 left.unlink(missing_ok=True)
         yield temporary
         with open(temporary, "rb+") as file:

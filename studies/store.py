@@ -11,6 +11,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping
+from hashlib import sha256
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -127,6 +128,15 @@ def _check_room(path: str | Path, needed: int) -> None:
             f"{path}: cannot write it, {needed / 2**20:.1f} MiB are needed and "
             f"{free / 2**20:.1f} MiB are free"
         )
+
+
+def numbers_digest(arrays: Mapping[str, Any]) -> str:
+    """Hash of arrays with their names, as an attribute that tells whether a file was changed."""
+    digest = sha256()
+    for name in sorted(arrays):
+        data = np.asarray(arrays[name])
+        digest.update(f"{name} {data.dtype} {data.shape} ".encode() + data.tobytes())
+    return digest.hexdigest()
 
 
 def axis_sizes(variables: Mapping[str, Variable]) -> dict[str, int]:

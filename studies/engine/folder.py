@@ -28,7 +28,7 @@ from jaxmodel.metrics import METRICS
 from studies import config, sources
 from studies.engine.columns import PER_CASE, SCREENED, label_of
 from studies.errors import StudyError
-from studies.publish import replacing
+from studies.publish import TEMPORARY, replacing
 from studies.reading import open_hdf5, open_regular, read_json
 
 RESULTS, MANIFEST, CHUNKS, LOCK = "results.h5", "sweep.json", "chunks", ".lock"
@@ -61,13 +61,13 @@ class Content(NamedTuple):
 SWEEPS = Content(
     "a sweep",
     MANIFEST,
-    re.compile(r"\.joined\.h5|\.(joined\.h5|baseline\.h5|sweep\.json)\.(\d+-)?[0-9a-f]{8}\.tmp"),
+    re.compile(rf"\.joined\.h5|\.(joined\.h5|baseline\.h5|sweep\.json)\.{TEMPORARY}"),
 )
-TUNINGS = Content("a tuning", TUNING, re.compile(r"\..+\.(\d+-)?[0-9a-f]{8}\.tmp"))
-SCREENS = Content("a screen", "screen.json", re.compile(r"\..+\.(\d+-)?[0-9a-f]{8}\.tmp"))
+TUNINGS = Content("a tuning", TUNING, re.compile(rf"\..+\.{TEMPORARY}"))
+SCREENS = Content("a screen", "screen.json", re.compile(rf"\..+\.{TEMPORARY}"))
 ATLASES = Content("an atlas", "runs", re.compile(r"\.unfinished-.*"))
 #: Of a folder with a request and folders of its own in it.
-_UNFINISHED = re.compile(r"\.unfinished-.*|\..+\.(\d+-)?[0-9a-f]{8}\.tmp")
+_UNFINISHED = re.compile(rf"\.unfinished-.*|\..+\.{TEMPORARY}")
 COMPARISONS = Content("a comparison of laws", "request.json", _UNFINISHED)
 COMMISSIONINGS = Content("a commissioning", "request.json", _UNFINISHED)
 

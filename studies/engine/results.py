@@ -6,7 +6,6 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +34,7 @@ from studies.space.axes import LABELS, SHOWN_AS
 from studies.space.condition import evaluate
 from studies.space.spec import SweepSpec, parse_sweep
 from studies.space.table import CaseTable, build_table, case_ids, designs
-from studies.store import Variable, axis_sizes, read_store, with_coordinates
+from studies.store import Variable, axis_sizes, numbers_digest, read_store, with_coordinates
 from studies.study.fields import Fields
 from studies.study.paths import NAMED_INDEX, known_field, parse_entry
 
@@ -180,12 +179,8 @@ DIGEST = "digest"
 
 def baseline_digest(variables: Mapping[str, Variable]) -> str:
     """Hash of a baseline's numbers."""
-    digest = sha256()
-    for name in sorted(variables):
-        if name in BASELINE_DIMS or name in METRICS:
-            data = np.asarray(variables[name].data)
-            digest.update(f"{name} {data.dtype} {data.shape} ".encode() + data.tobytes())
-    return digest.hexdigest()
+    own = {name for name in variables if name in BASELINE_DIMS or name in METRICS}
+    return numbers_digest({name: variables[name].data for name in own})
 
 
 def baseline_id(spec: SweepSpec) -> str:

@@ -25,8 +25,8 @@ from studies.engine.stored import chunk_arrays, gather, kept_metrics
 from studies.errors import StudyError, nearest
 from studies.space.condition import evaluate
 from studies.space.spec import Screen, SweepSpec
-from studies.space.table import CaseTable
-from studies.study.entries import entry_sizes, parse_entries
+from studies.space.table import CaseTable, metric_sizes
+from studies.study.entries import parse_entries
 from studies.study.paths import NAMED_INDEX
 
 #: Most random cases that show what the screen lost.
@@ -56,10 +56,7 @@ def check_screen_names(spec: SweepSpec, table: CaseTable) -> None:
     if spec.screen is None:
         return
     metrics = kept_metrics(spec)
-    sizes = entry_sizes(spec.study) | {
-        "mode": int(table.values("link.modes").max()),
-        "controlled_mode": int(table.values("control.modes").max()),
-    }
+    sizes = metric_sizes(table)
     parse_entries(spec.screen.entry, "sweep.screen.by", sizes)
 
     def lookup(name: str) -> np.ndarray:

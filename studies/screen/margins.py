@@ -6,8 +6,7 @@ import numpy as np
 
 from studies.engine.chunks import judge_cases
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
-from studies.screen.shards import ScreenRequest
-from studies.space.table import build_table
+from studies.screen.shards import ScreenRequest, designs_table
 
 #: Designs that are judged, best first.
 JUDGED = 10_000
@@ -24,16 +23,15 @@ def kept_margins(screen: ScreenRequest, row: np.ndarray) -> np.ndarray:
     found = np.full(len(row), np.nan)
     if not len(row):
         return found
-    table = build_table(screen.spec, np.sort(judged))
+    table = designs_table(screen, judged)
     margin = np.full(len(table), np.nan)
-    groups = plan_groups(table, np.arange(len(table)), local_layout, (screen.metric,), True)
+    groups = plan_groups(
+        table, np.arange(len(table)), local_layout, (screen.metric,), is_linear=True
+    )
     for group in groups:
         for chunk in group.chunks():
             cases = chunk_cases(table, chunk.rows, group.structure, group.layout.size)
             figures = judge_cases(group.structure, cases)
             margin[chunk.rows] = np.asarray(figures.gain_margin)[: len(chunk.rows)]
-    place = {int(one): k for k, one in enumerate(table.row)}
-    found[: len(judged)] = [
-        margin[place[one]] if one in place else np.nan for one in judged.tolist()
-    ]
+    found[: len(judged)][np.isin(judged, table.row)] = margin
     return found

@@ -13,13 +13,12 @@ from jaxmodel.metrics import METRICS
 from studies.publish import REPORT, publish
 from studies.screen.plots import influence, values
 from studies.screen.run import ScreenOutcome
-from studies.screen.shards import axis_numbers
+from studies.screen.shards import axis_numbers, designs_table
 from studies.screen.stored import BEST
 from studies.screen.tally import LEFT_OUT, quantile
 from studies.show.figures import styled
 from studies.show.pages import page
 from studies.show.units import headed, readable
-from studies.space.table import build_table
 from studies.study.margin import ENOUGH, margin_text
 from studies.study.template import toml_text
 from studies.sweeps.plots import save_plot
@@ -137,21 +136,19 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
 def _best_rows(done: ScreenOutcome) -> tuple[list[str], list[tuple[str, ...]]]:
     """Names of the columns of text, such as the kind of the shaper; rows of the best designs."""
     rows = done.tally.row[:SHOWN]
-    table = build_table(done.screen.spec, np.sort(rows))
+    table = designs_table(done.screen, rows)
+    is_there = np.isin(rows, table.row)
     texts = {name: column for name, column in table.fields.items() if column.dtype.kind == "U"}
-    place = {int(row): k for k, row in enumerate(table.row)}
     numbers = axis_numbers(table)
-    factor = readable(unit_of(done))[0]
+    value = readable(unit_of(done))[0] * done.tally.value[:SHOWN][is_there]
+    margin = done.margin[:SHOWN][is_there]
     return list(texts), [
         (
             str(row),
-            f"{factor * value:.4g}",
-            margin_text(margin),
-            *(str(column[place[row]]) for column in texts.values()),
-            *(f"{numbers[name][place[row]]:.4g}" for name in done.screen.axes.names),
+            f"{value[k]:.4g}",
+            margin_text(margin[k]),
+            *(str(column[k]) for column in texts.values()),
+            *(f"{numbers[name][k]:.4g}" for name in done.screen.axes.names),
         )
-        for row, value, margin in zip(
-            rows.tolist(), done.tally.value.tolist(), done.margin.tolist(), strict=False
-        )
-        if row in place
+        for k, row in enumerate(table.row)
     ]

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from rich.console import Console
@@ -21,8 +20,10 @@ from studies.engine.sweep import interrupts
 from studies.screen.margins import kept_margins
 from studies.screen.shards import ScreenRequest, shard_tally
 from studies.screen.stored import begin, write_best, write_tally
-from studies.screen.tally import LEFT_OUT, Tally, merged, only_left_out
+from studies.screen.tally import LEFT_OUT, Tally, merged
 from studies.space.table import CaseTable, build_table
+
+T = TypeVar("T")
 
 PHASES = ("screen", "report")
 
@@ -37,10 +38,6 @@ class ScreenProgress:
         self.say, self._phases = phases.say, phases
         self._total, self._done, self._before = total, done, done
         self._began, self._next, self._n_failed = time.perf_counter(), 0.0, 0
-
-    def count(self, code: np.ndarray) -> None:
-        """Some designs have run; codes are their statuses."""
-        self.add(np.bincount(code))
 
     def add(self, endings: np.ndarray) -> None:
         """Some designs are done; how many have each status code, or were left out."""
@@ -92,28 +89,28 @@ class LocalScreener:
         progress: ScreenProgress,
         stop: threading.Event,
     ) -> Iterator[tuple[int, Tally | str]]:
-        waiting = iter(shards)
+        def make(shard: int) -> tuple[int, CaseTable]:
+            return shard, build_table(screen.spec, screen.rows(shard))
 
         with ThreadPoolExecutor(1) as pool:
-            make = partial(_made, pool, screen)
-            coming = make(next(waiting, None))
-            while coming is not None:
-                shard, table = coming[0], coming[1].result()
-                coming = make(next(waiting, None))
-                progress.add(only_left_out(len(screen.rows(shard)) - len(table)))
-                tally = shard_tally(screen, shard, table, stop, progress.count)
+            for shard, table in _one_ahead(pool, make, shards):
+                tally = shard_tally(screen, shard, table, stop, progress.add)
                 if tally is None:
                     return
                 yield shard, tally
 
 
-def _made(
-    pool: ThreadPoolExecutor, screen: ScreenRequest, shard: int | None
-) -> tuple[int, Future[CaseTable]] | None:
-    """A shard and its table, once it is made; None for None."""
-    if shard is None:
-        return None
-    return shard, pool.submit(build_table, screen.spec, screen.rows(shard))
+def _one_ahead(
+    pool: ThreadPoolExecutor, make: Callable[[int], T], numbers: Iterable[int]
+) -> Iterator[T]:
+    """What is made of numbers, the next one of which is being made meanwhile."""
+    coming: Future[T] | None = None
+    for number in numbers:
+        ready, coming = coming, pool.submit(make, number)
+        if ready is not None:
+            yield ready.result()
+    if coming is not None:
+        yield coming.result()
 
 
 class ScreenOutcome(NamedTuple):

@@ -17,13 +17,13 @@ from studies.engine.progress import Phases, Reporter
 from studies.engine.results import SweepData, direction, metric_values
 from studies.engine.stored import chunk_arrays
 from studies.errors import StudyError, field_error
-from studies.screen.tally import Axes, Tally, divided, merged, nothing, only_left_out, tally_of
+from studies.screen.tally import Axes, Tally, divided, merged, nothing, tally_of
 from studies.space.axes import LIMIT
 from studies.space.designs import LazyCases, design_of
 from studies.space.methods import METHODS
 from studies.space.spec import SweepSpec
-from studies.space.table import CaseTable, as_numbers, build_table
-from studies.study.entries import entry_sizes, parse_entries
+from studies.space.table import CaseTable, as_numbers, build_table, metric_sizes
+from studies.study.entries import parse_entries
 from studies.study.fields import Columns
 
 #: Designs of a shard.
@@ -114,11 +114,7 @@ def screen_of(
             f"sweep.where = {spec.sweep.where!r}: true for none of {len(tried)} designs tried; "
             "narrow the axes to where it holds"
         )
-    sizes = entry_sizes(spec.study) | {
-        "mode": int(table.values("link.modes").max()),
-        "controlled_mode": int(table.values("control.modes").max()),
-    }
-    parse_entries(by.removeprefix("-"), "--by", sizes)
+    parse_entries(by.removeprefix("-"), "--by", metric_sizes(table))
     return ScreenRequest(
         spec=spec,
         by=by,
@@ -159,12 +155,28 @@ def axis_numbers(table: CaseTable) -> Columns:
     return found
 
 
+def designs_table(screen: ScreenRequest, row: np.ndarray) -> CaseTable:
+    """Table of some designs.
+
+    Args:
+        screen: of the designs.
+        row: their numbers in any order, (n,).
+
+    Returns:
+        Their cases in that order, without those that repeat the parameters of another.
+    """
+    order = np.argsort(row)
+    table = build_table(screen.spec, row[order])
+    place = order[np.searchsorted(row[order], table.row)]
+    return table.rows(np.argsort(place))
+
+
 def shard_tally(
     screen: ScreenRequest,
     shard: int,
     table: CaseTable,
     stop: threading.Event,
-    on_chunk: Callable[[np.ndarray], object] = lambda code: None,
+    on_endings: Callable[[np.ndarray], object] = lambda endings: None,
 ) -> Tally | None:
     """Run the designs of a shard in this process and reduce them.
 
@@ -173,14 +185,14 @@ def shard_tally(
         shard: its number.
         table: of its designs.
         stop: once set, no further chunks are started.
-        on_chunk: called with the status codes of each chunk.
+        on_endings: called with how many designs of each part have ended in which way.
 
     Returns:
         The tally; None if it was stopped.
     """
     count = len(table)
-    dropped = only_left_out(len(screen.rows(shard)) - count)
-    total = nothing(screen.axes)._replace(endings=dropped)
+    total = nothing(screen.axes, len(screen.rows(shard)) - count)
+    on_endings(total.endings)
     if not count:
         return total
     is_linear = screen.spec.sweep.fidelity == "linear"
@@ -193,17 +205,15 @@ def shard_tally(
         reporter = Reporter(phases, "run", count, 0, len(groups))
         for done in LocalRunner().run(table, groups, reporter, stop):
             assert isinstance(done, Done)  # only workers of a cluster give chunks up
-            arrays = chunk_arrays(table, done, [screen.metric])
-            total = merged(total, _chunk_tally(screen, table, done, arrays), *screen.ranking)
-            n_run += len(done.chunk.rows)
-            on_chunk(arrays["status"])
+            part = _chunk_tally(screen, table, done)
+            total = merged(total, part, *screen.ranking)
+            n_run += part.n_designs
+            on_endings(part.endings)
     return total if n_run == count else None
 
 
-def _chunk_tally(
-    screen: ScreenRequest, table: CaseTable, done: Done, arrays: dict[str, np.ndarray]
-) -> Tally:
-    part = table.rows(done.chunk.rows)
+def _chunk_tally(screen: ScreenRequest, table: CaseTable, done: Done) -> Tally:
+    part, arrays = table.rows(done.chunk.rows), chunk_arrays(table, done, [screen.metric])
     variables = {name: labelled(name, data) for name, data in arrays.items() if name != "case_id"}
     value = metric_values(SweepData(variables, {}, screen.spec, part), screen.entry)
     columns = axis_numbers(part)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +10,11 @@ import numpy as np
 from studies.engine.folder import keep_request, make_manifest
 from studies.errors import StudyError
 from studies.publish import replacing
-from studies.screen.shards import ScreenRequest
+from studies.screen.shards import ScreenRequest, designs_table
 from studies.screen.tally import BUCKETS, GROWTH, LEAST, N_ENDINGS, Tally, nothing
 from studies.space.axes import LABELS
-from studies.space.table import as_python, build_table
-from studies.store import Variable, read_store, write_store
+from studies.space.table import as_python
+from studies.store import Variable, numbers_digest, read_store, write_store
 from studies.study.template import toml_text, toml_value
 
 REQUEST, TALLY, BEST = "screen.json", "screen.h5", "best.toml"
@@ -85,11 +84,7 @@ def read_tally(folder: Path, screen: ScreenRequest) -> tuple[np.ndarray, Tally]:
 
 
 def _digest(is_done: np.ndarray, tally: Tally) -> str:
-    """Hash of a tally's numbers."""
-    digest = blake2b(np.packbits(is_done).tobytes(), digest_size=8)
-    for name, array in tally._asdict().items():
-        digest.update(np.asarray(array, float if name == "value" else np.int64).tobytes())
-    return digest.hexdigest()
+    return numbers_digest({"is_done": is_done, **tally._asdict()})
 
 
 def _damaged(path: Path, what: str) -> StudyError:
@@ -140,14 +135,10 @@ def best_sweep(screen: ScreenRequest, tally: Tally) -> str:
     sweep: dict[str, Any] = written | {"method": "list", "by": screen.by}
     sweep.pop("fidelity", None)
     sections = {name: x for name, x in data.items() if name != "sweep"}
-    rows = np.sort(tally.row)
-    table = build_table(screen.spec, rows)
-    place = {int(row): k for k, row in enumerate(table.row)}
+    table = designs_table(screen, tally.row)
     fields = {name: x for name, x in table.fields.items() if name not in LABELS}
     cases = [
-        {name: as_python(column[place[row]]) for name, column in fields.items()}
-        for row in tally.row.tolist()
-        if row in place  # others have the parameters of an earlier one
+        {name: as_python(column[k]) for name, column in fields.items()} for k in range(len(table))
     ]
     lines = "".join(f"  {toml_value(case)},\n" for case in cases)
     return f"{toml_text({**sections, 'sweep': sweep})}cases = [\n{lines}]\n"

@@ -82,21 +82,16 @@ def _between(x: np.ndarray) -> np.ndarray:
     return np.asarray((x[1:] + x[:-1]) / 2)
 
 
-def nothing(axes: Axes) -> Tally:
-    """The tally of no designs."""
+def nothing(axes: Axes, n_left_out: int = 0) -> Tally:
+    """The tally of designs of which none has run: those that `where` leaves out."""
+    endings = np.zeros(N_ENDINGS, np.int64)
+    endings[LEFT_OUT] = n_left_out
     return Tally(
-        endings=np.zeros(N_ENDINGS, np.int64),
+        endings=endings,
         row=np.zeros(0, np.int64),
         value=np.zeros(0),
         sketch=np.zeros((axes.n_sketches, BUCKETS), np.int64),
     )
-
-
-def only_left_out(count: int) -> np.ndarray:
-    """Endings of designs of which none runs, (N_ENDINGS,)."""
-    endings = np.zeros(N_ENDINGS, np.int64)
-    endings[LEFT_OUT] = count
-    return endings
 
 
 def tally_of(

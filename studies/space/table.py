@@ -21,6 +21,7 @@ from studies.space.condition import evaluate
 from studies.space.designs import design_of
 from studies.space.spec import SweepSpec
 from studies.study.consistency import SAMPLE_LIMIT
+from studies.study.entries import entry_sizes
 from studies.study.fields import Columns, Fields, padded
 from studies.study.paths import (
     Parts,
@@ -201,6 +202,14 @@ def values(study: Study, columns: Columns, name: str) -> np.ndarray:
         raise StudyError(f"{name}: a list in this sweep; name one entry of it, such as {name}[0]")
     chosen = np.moveaxis(array, 0, -1)[entry.indices]
     return chosen > 0 if isinstance(value, bool) else chosen
+
+
+def metric_sizes(table: CaseTable) -> dict[str, int]:
+    """Lengths of the axes of metrics over all cases."""
+    return entry_sizes(table.study) | {
+        "mode": int(table.values("link.modes").max()),
+        "controlled_mode": int(table.values("control.modes").max()),
+    }
 
 
 def _check_shapes(columns: Columns) -> None:
