@@ -431,3 +431,23 @@ def test_one_step_per_sample_is_enough_for_the_fastest_moves():
     signals = (np.asarray(x.record.chord_deflection_stations) for x in (one, eight))
     coarse, fine = signals
     assert np.abs(coarse - fine).max() < 1e-5 * np.abs(fine).max()
+
+
+def test_records_are_of_the_sampling_instant():
+    """However many steps lead to the next one."""
+    study = paper_study().change(
+        motion__waypoints=(HOME, (0.0, 0.01, HOME[2])),
+        motion__move_time=0.02,
+        shaper__kind="none",
+        run__duration=0.04,
+        metrics__residual_delay=0.0,
+        metrics__residual_length=0.01,
+        run__smooth=True,
+    )
+    one, four = (
+        np.asarray(_simulate(*arrays(study.change(run__substeps=n)), True).record.slider)
+        for n in (1, 4)
+    )
+    # a step of the four moves sliders by far more than what follows allows
+    assert np.abs(np.diff(four, axis=0)).max() / 4 > 1e-5
+    np.testing.assert_allclose(one, four, rtol=0, atol=1e-7)

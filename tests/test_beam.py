@@ -107,6 +107,29 @@ def test_slope_differences_are_those_of_the_shapes(shapes):
         np.testing.assert_allclose(found[0], wanted, atol=1e-6 * np.abs(wanted).max())
 
 
+@pytest.mark.parametrize("kind", ["pinned_pinned", "loaded"])
+def test_shortening_integrals_equal_quadrature_of_slopes(kind):
+    """Of Y_j' Y_k' alone, and with the mass and its first moment beyond."""
+    x, w = points_and_weights(is_loaded=False)
+    w = w / LINE_MASS
+    step = 1e-7  # within a section
+    build = jax.jit(lambda at: build_basis(kind, BEAM, PATCHES, N_MODES, at))
+    basis = jax.tree.map(np.asarray, build(np.concatenate([x + step, x - step])))
+    slope = np.diff(basis.deflection_at[0].reshape(2, x.size, N_MODES), axis=0)[0] / (-2 * step)
+    ends, line_mass, _ = sections()
+    line_mass = line_mass if kind == "loaded" else np.full(len(ends) - 1, LINE_MASS)
+    begin = np.clip(x[:, None], ends[:-1], ends[1:])
+    beyond = (ends[1:] - begin) @ line_mass, (ends[1:] ** 2 - begin**2) @ line_mass / 2
+    mixed = 0 if basis.mixed_shortening is None else basis.mixed_shortening[0]
+    for found, weight in (
+        (np.diag(basis.shortening[0]) + mixed, w),
+        (basis.inward[0], w * beyond[0]),
+        (basis.centrifugal[0], w * beyond[1]),
+    ):
+        wanted = (slope.T * weight) @ slope
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-6 * np.abs(wanted).max())
+
+
 @pytest.mark.parametrize(("kind", "share"), [("pinned_pinned", 1 / 2), ("pinned_free", 1 / 4)])
 def test_bare_shapes_satisfy_the_beam_equation_in_their_normalisation(kind, share):
     basis = low_basis(kind)

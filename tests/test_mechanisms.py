@@ -3,10 +3,12 @@
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxmodel import kinematics, status
+from jaxmodel.axial import stretch_error
 from jaxmodel.case import uncontrolled
 from jaxmodel.frequency_response import plant_response
 from jaxmodel.linear import linearise
@@ -108,6 +110,32 @@ def test_two_links_hold_the_joint_between_them_by_the_sine_of_their_angle():
     np.testing.assert_allclose(
         jax.vmap(kinematics.hold)(chain), np.abs(np.sin(angle[:, 1] - angle[:, 0])), rtol=1e-12
     )
+
+
+@pytest.mark.parametrize("name", MACHINES)
+@pytest.mark.parametrize("has_tip", [False, True])
+def test_links_that_stretch_move_the_platform_as_far_as_it_takes(name, has_tip):
+    """Distances between joints, differentiated by the pose, grow by each link's stretch."""
+    machine = MACHINES[name]
+    _, plant = make("pinned_free" if has_tip else "pinned_pinned", machine)
+    motion, _ = states(machine)
+    pose, stretch = motion.pose[:20], np.random.default_rng(1).normal(size=motion.pose[:20].shape)
+
+    def distances(pose, near):
+        far = reference.platform_joints(machine.geometry, pose) - near
+        return jnp.sqrt(jnp.sum(far**2, axis=1))
+
+    def grown(pose, stretch):
+        still = jnp.zeros_like(pose)
+        straight = kinematics.Bend(tip=still) if has_tip else None
+        chain = kinematics.close_chain(plant, pose, still, straight)
+        near = reference.near_joints(machine.geometry, chain.rho)
+        by_pose = jax.jacfwd(distances)(pose, near)
+        return distances(pose, near), by_pose @ stretch_error(chain, stretch)
+
+    length, found = jax.vmap(grown)(pose, stretch)
+    np.testing.assert_allclose(length, np.broadcast_to(plant.length, length.shape), rtol=1e-12)
+    np.testing.assert_allclose(found, stretch, atol=1e-11)
 
 
 # --- the sampled loop -----------------------------------------------------------------------------

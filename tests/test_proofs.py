@@ -215,6 +215,43 @@ def test_the_tail_covers_the_modes_left_out(design, law, has_correction):
     assert largest > 0.05  # the bound is not idle
 
 
+def with_known(loop, count):
+    """The loop with fewer modes known one by one."""
+    first = {name: getattr(loop, name)[:, :count] for name in ("omega", "spring", "zeta")}
+    last = {name: getattr(loop, name)[..., :count] for name in ("enter", "leave", "sensor")}
+    return loop._replace(**first, **last, actuator=loop.actuator[:, :count])
+
+
+def test_patches_are_nowhere_steeper_than_their_bound(loop):
+    """Over 200 modes a patch comes close to the antinodes of some."""
+    order = np.arange(1, KNOWN + 1)
+    sensor = np.max(np.abs(loop.sensor) / order, axis=2)
+    actuator = np.max(np.abs(loop.actuator) / order[:, None], axis=1)
+    for found, bound in zip((sensor, actuator), loop.steepest, strict=True):
+        assert np.all((found <= bound * (1 + 1e-9)) & (found > 0.9 * bound))
+
+
+@pytest.mark.parametrize("has_correction", [True, False])
+def test_modes_that_are_not_known_are_covered_and_hardly_more(loop, has_correction):
+    """A tail of 120 known modes and a bound on the others against one of 200."""
+    if not has_correction:
+        loop = loop._replace(exact=None)
+    one = 1.0, 1.0
+    known, bound = (bound_tail(x, LARGEST, NEAR, one, 0.0) for x in (loop, with_known(loop, 120)))
+    for name, exact, found in zip(known._fields, known, bound, strict=True):
+        is_there = exact > 1e-9 * exact.max()
+        ratio = found[is_there] / exact[is_there]
+        assert ratio.min() >= 1, name
+        assert np.median(ratio) < 1.2 and ratio.max() < 5, name
+
+
+def test_images_that_the_model_has_leave_less(loop):
+    one = 1.0, 1.0
+    none, few = (bound_tail(loop, LARGEST, near, one, 0.0).images for near in (0, NEAR))
+    assert np.all(few <= none)
+    assert np.median(few[few > 0] / none[few > 0]) < 0.5
+
+
 def test_damping_that_falls_with_frequency_has_no_bound(loop):
     assert bound_tail(loop._replace(exponent=-1.0), LARGEST, NEAR, (1.0, 1.0), 0.0) is None
     with pytest.raises(ValueError, match="no bound of the modes"):

@@ -6,6 +6,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+import scipy.interpolate
 import scipy.linalg
 
 from jaxmodel import sampled_loop
@@ -236,6 +237,52 @@ def test_ideal_feedback_damps_up_to_a_limit():
     np.testing.assert_allclose(zeta[1:].min(axis=1), [0.044, 0.012], atol=5e-4)
     # ten times the gain damps mode 1 less: the aliased modes' feed-through closes a loop of its own
     np.testing.assert_allclose(ideal_damping(10.0)[0].min(), 0.046, atol=1e-3)
+
+
+def test_ideal_feedback_of_a_run_is_its_gains_times_rates():
+    """Rates by splines through deflections sampled ten times in a period of the fastest mode."""
+    study = paper_study().change(
+        link__modes=2,
+        control__feedback="ideal",
+        control__modes=2,
+        control__velocity_gain=(1.0, 0.5, 0.7),
+        initial__modal=((1e-4, 2e-5), (), (-1e-4, 0.0)),
+        motion__waypoints=(HOME, HOME),
+        motion__move_time=0.01,
+        run__duration=0.03,
+        metrics__residual_delay=0.0,
+        metrics__residual_length=0.01,
+    )
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    record = jax.jit(simulate, static_argnums=(0, 2))(structure, case, True).record
+    on_rate = np.asarray(prepared(structure, case).loop.ideal[0])
+    path = scipy.interpolate.CubicSpline(record.time, record.modal_coordinate)
+    wanted = np.einsum("ikr,nir->nik", on_rate, path(record.time, 1))
+    inside = slice(3, -3)
+    size = np.abs(wanted).max()
+    assert 1 < size < 50  # below the limit
+    found = np.asarray(record.actuator_voltage)
+    np.testing.assert_allclose(found[inside], wanted[inside], rtol=0, atol=0.01 * size)
+
+
+def test_what_rests_stays_at_rest():
+    """With every state of the electronics."""
+    study = STUDY.change(
+        motion__waypoints=(HOME, HOME),
+        motion__move_time=0.01,
+        electronics__amplifier_hz=2e3,
+        electronics__sensor_highpass_hz=5.0,
+        electronics__delay=1.5,
+        run__duration=0.03,
+        run__smooth=True,
+        metrics__residual_delay=0.0,
+        metrics__residual_length=0.01,
+    )
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    structure = structure._replace(has_noise=False)
+    record = jax.jit(simulate, static_argnums=(0, 2))(structure, case, True).record
+    for name in ("sensor_voltage", "actuator_voltage", "modal_coordinate", "pose_error"):
+        np.testing.assert_allclose(getattr(record, name), 0.0, rtol=0, atol=1e-12, err_msg=name)
 
 
 def test_feedthrough_of_the_aliased_modes():
