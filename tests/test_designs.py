@@ -338,15 +338,40 @@ def test_too_many_designs_are_refused_before_any_runs():
 
 
 def test_report_of_axes_of_text(tmp_path):
-    spec = small_spec({"method": "grid", "axes": {"shaper.kind": ["none", "zv"]}})
-    done = screened(tmp_path, spec)
+    kinds, gains = ["quintic", "cycloid"], [0.5, 1.0]
+    axes = {"motion.profile": kinds, "control.gain_factor": gains}
+    done = screened(tmp_path, small_spec({"method": "grid", "axes": axes}))
     write_screen_report(tmp_path, done)
-    tally, text = done.tally, text_of((tmp_path / "report.html").read_text())
-    kind = ("none", "zv")[tally.row[0]]
-    assert re.search(
-        rf"\| shaper\.kind \|.*\| {tally.row[0]} \|[^\n]*\| {kind} \|", text, re.DOTALL
+    axes, tally, text = (
+        done.screen.axes,
+        done.tally,
+        text_of((tmp_path / "report.html").read_text()),
     )
-    assert not (tmp_path / "influence.png").exists()
+    assert axes.names == ("motion.profile", "control.gain_factor")
+    assert axes.labels[0].tolist() == sorted(kinds) and not len(axes.labels[1])
+    # each kind's two values are where they belong
+    for label, counts in zip(axes.labels[0], tally.sketch[axes.part(0)], strict=True):
+        values = tally.value[[kinds[row // len(gains)] == label for row in tally.row]]
+        assert counts.sum() == len(values) == 2
+        for value, share in zip(np.sort(values), (0.5, 1.0), strict=True):
+            np.testing.assert_allclose(quantile(counts, share), value, rtol=0.02)
+    kind = kinds[tally.row[0] // len(gains)]
+    assert re.search(
+        rf"\| motion\.profile \|.*\| 0 \| {tally.row[0]} \|[^\n]*\| {kind} \|", text, re.DOTALL
+    )
+    assert (tmp_path / "influence.png").exists()
+
+
+def test_designs_without_margin_are_not_shown_as_the_best(tmp_path):
+    """The table holds those with a margin above 2, under their numbers in best.toml."""
+    done = screened(tmp_path, SPEC)
+    margin = np.full(len(done.margin), 0.5)
+    margin[3] = 2.5
+    write_screen_report(tmp_path, done._replace(margin=margin))
+    text = text_of((tmp_path / "report.html").read_text())
+    assert "Those with a gain margin above 2." in text
+    assert len(re.findall(r"^\| *\d+ \|.*\| 0\.5 \|", text, re.MULTILINE)) == 0
+    assert re.search(rf"^\| *3 \| {done.tally.row[3]} \|.*\| 2\.5 \|", text, re.MULTILINE)
 
 
 def test_nothing_is_kept_where_no_design_ends_well(tmp_path, capsys):

@@ -16,6 +16,8 @@ from studies.study.paths import field_unit
 ACROSS = 3
 #: Shares of the designs in an interval, counted from the best: the curves.
 CURVES = ((0.5, "median"), (0.1, "best 10 %"), (0.001, "best 0.1 %"))
+#: Ratio of the ends from which on an axis is drawn on a log scale.
+WIDE = 20
 
 
 def values(done: ScreenOutcome) -> Figure:
@@ -49,13 +51,20 @@ def influence(done: ScreenOutcome) -> Figure:
         ax.set_visible(False)
     for k, (ax, name) in enumerate(zip(panels, screen.axes.names, strict=False)):
         part = done.tally.sketch[screen.axes.part(k)]
+        centers, labels = screen.axes.centers[k], screen.axes.labels[k]
+        style = "o" if len(labels) else "-"
         for (share, text), color in zip(CURVES, figures.SERIES, strict=False):
             at = 1 - share if is_largest else share
             curve = [factor * quantile(counts, at) for counts in part]
-            ax.plot(screen.axes.centers[k], curve, color=color, lw=1.2, label=text)
+            ax.plot(centers, curve, style, color=color, lw=1.2, label=text)
         own = field_unit(name.partition("[")[0])
         ax.set_xlabel(name if own == "1" else f"{name}\n[{own}]")
+        if len(labels):
+            ax.set_xticks(centers, labels)
+            ax.margins(x=0.2)
+        elif centers[0] > 0 and centers[-1] > WIDE * centers[0]:
+            figures.log_scale(ax, "x")
         figures.log_scale(ax, "y")
-    panels[0].set_ylabel(headed(screen.entry, unit))
+    panels[0].set_ylabel(headed(screen.entry.replace("[", "\n[", 1), unit))
     figures.legend_above(figure, panels[0])
     return figure

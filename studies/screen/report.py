@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -11,9 +12,10 @@ from matplotlib.figure import Figure
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
 from studies.publish import REPORT, publish
+from studies.screen.margins import JUDGED
 from studies.screen.plots import influence, values
 from studies.screen.run import ScreenOutcome
-from studies.screen.shards import axis_numbers, designs_table
+from studies.screen.shards import axis_columns, designs_table
 from studies.screen.stored import BEST
 from studies.screen.tally import LEFT_OUT, quantile
 from studies.show.figures import styled
@@ -102,7 +104,7 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
         drawings[VALUES] = values
     if len(tally.row) and screen.axes.names:
         drawings[INFLUENCE] = influence
-    texts, rows = _best_rows(done) if len(tally.row) else ([], [])
+    rows = _best_rows(done) if len(tally.row) else []
     with publish(folder, stale=(VALUES, INFLUENCE)) as staging:
         with styled():
             for name, draw in drawings.items():
@@ -121,34 +123,40 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
             endings=ending_rows(done),
             quantiles=quantile_rows(done),
             heads=(
+                "case",
                 "design",
                 headed(screen.entry, unit_of(done)),
                 "gain margin",
-                *texts,
                 *screen.axes.names,
             ),
             rows=rows,
+            is_robust=bool(np.any(done.margin > ENOUGH)),
+            enough=ENOUGH,
             lost=done.lost,
         )
         (staging / REPORT).write_text(text, encoding="utf-8")
 
 
-def _best_rows(done: ScreenOutcome) -> tuple[list[str], list[tuple[str, ...]]]:
-    """Names of the columns of text, such as the kind of the shaper; rows of the best designs."""
-    rows = done.tally.row[:SHOWN]
-    table = designs_table(done.screen, rows)
-    is_there = np.isin(rows, table.row)
-    texts = {name: column for name, column in table.fields.items() if column.dtype.kind == "U"}
-    numbers = axis_numbers(table)
-    value = readable(unit_of(done))[0] * done.tally.value[:SHOWN][is_there]
-    margin = done.margin[:SHOWN][is_there]
-    return list(texts), [
+def _best_rows(done: ScreenOutcome) -> list[tuple[str, ...]]:
+    """Of the best designs, those with margin enough; of all, if there are none."""
+    judged = done.tally.row[:JUDGED]
+    table = designs_table(done.screen, judged)
+    place = np.flatnonzero(np.isin(judged, table.row))  # of the cases of `best.toml`
+    columns = axis_columns(table)
+    factor = readable(unit_of(done))[0]
+    robust = np.flatnonzero(done.margin[place] > ENOUGH)
+    cases = robust if len(robust) else np.arange(len(table))
+    return [
         (
-            str(row),
-            f"{value[k]:.4g}",
-            margin_text(margin[k]),
-            *(str(column[k]) for column in texts.values()),
-            *(f"{numbers[name][k]:.4g}" for name in done.screen.axes.names),
+            str(case),
+            str(table.row[case]),
+            f"{factor * done.tally.value[place[case]]:.4g}",
+            margin_text(done.margin[place[case]]),
+            *(_shown(columns[name][case]) for name in done.screen.axes.names),
         )
-        for k, row in enumerate(table.row)
+        for case in cases[:SHOWN]
     ]
+
+
+def _shown(value: Any) -> str:
+    return str(value) if isinstance(value, str) else f"{value:.4g}"

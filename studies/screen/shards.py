@@ -120,7 +120,7 @@ def screen_of(
         by=by,
         keep=keep,
         n_designs=design.size,
-        axes=divided(_distinct(axis_numbers(table))),
+        axes=divided(_distinct(axis_columns(table))),
         shard_size=shard_size or SHARD,
     )
 
@@ -137,16 +137,17 @@ def _distinct(columns: Columns) -> Columns:
     found: dict[str, np.ndarray] = {}
     for name, column in columns.items():
         is_known = any(np.array_equal(column, other) for other in found.values())
-        if not is_known and column.min() < column.max():
+        if not is_known and np.any(column != column[0]):
             found[name] = column
     return found
 
 
-def axis_numbers(table: CaseTable) -> Columns:
-    """Numbers of all columns, by the names of fields and entries, (n,) each."""
+def axis_columns(table: CaseTable) -> Columns:
+    """Numbers and texts of a table, by the names of fields and entries, (n,) each."""
     found: dict[str, np.ndarray] = {}
     for name, column in table.fields.items():
         if column.dtype.kind not in "bif":
+            found |= {name: column} if column.dtype.kind == "U" else {}
             continue
         numbers = np.asarray(as_numbers(column, table.study.n_links), float)
         for place in np.ndindex(numbers.shape[1:]):
@@ -216,7 +217,7 @@ def _chunk_tally(screen: ScreenRequest, table: CaseTable, done: Done) -> Tally:
     part, arrays = table.rows(done.chunk.rows), chunk_arrays(table, done, [screen.metric])
     variables = {name: labelled(name, data) for name, data in arrays.items() if name != "case_id"}
     value = metric_values(SweepData(variables, {}, screen.spec, part), screen.entry)
-    columns = axis_numbers(part)
+    columns = axis_columns(part)
     return tally_of(
         part.row, arrays["status"], np.asarray(value, float), columns, screen.axes, *screen.ranking
     )

@@ -47,6 +47,7 @@ class Axes(NamedTuple):
     names: tuple[str, ...]
     bounds: tuple[np.ndarray, ...]  # between the intervals, ascending, (intervals - 1,)
     centers: tuple[np.ndarray, ...]  # where the intervals are drawn, (intervals,)
+    labels: tuple[np.ndarray, ...]  # of an axis of text, its values, an interval each; else (0,)
 
     @property
     def n_sketches(self) -> int:
@@ -58,24 +59,34 @@ class Axes(NamedTuple):
         first = 1 + sum(len(bounds) + 1 for bounds in self.bounds[:axis])
         return slice(first, first + len(self.bounds[axis]) + 1)
 
+    def interval(self, axis: int, x: np.ndarray) -> np.ndarray:
+        """Which interval values are in, (n,)."""
+        labels = self.labels[axis]
+        numbers = np.searchsorted(labels, x) if len(labels) else x
+        return np.searchsorted(self.bounds[axis], numbers, side="right")
+
 
 def divided(columns: Columns) -> Axes:
     """Axes of some designs, divided into intervals with about as many of them each.
 
     Args:
-        columns: numbers of every axis, from `axis_numbers`.
+        columns: of every axis, from `axis_columns`.
     """
-    bounds, centers = [], []
+    bounds, centers, labels = [], [], []
     for x in columns.values():
         distinct = np.unique(x)
-        if len(distinct) > INTERVALS:
+        is_text = distinct.dtype.kind == "U"
+        labels.append(distinct if is_text else np.zeros(0, str))
+        if is_text:
+            distinct = np.arange(len(distinct))
+        elif len(distinct) > INTERVALS:
             edges = np.unique(np.quantile(x, np.linspace(0, 1, INTERVALS + 1)))
             bounds.append(edges[1:-1])
             centers.append(_between(edges))
-        else:
-            bounds.append(_between(distinct))
-            centers.append(distinct)
-    return Axes(tuple(columns), tuple(bounds), tuple(centers))
+            continue
+        bounds.append(_between(distinct))
+        centers.append(distinct)
+    return Axes(tuple(columns), tuple(bounds), tuple(centers), tuple(labels))
 
 
 def _between(x: np.ndarray) -> np.ndarray:
@@ -109,7 +120,7 @@ def tally_of(
         row: their numbers, (n,).
         code: how they ended, (n,).
         value: what they are ranked by, (n,).
-        columns: numbers of every axis, (n,) each.
+        columns: of every axis, (n,) each.
         axes: of the screen.
         keep: most designs kept.
         is_largest: large values are the best.
@@ -122,7 +133,7 @@ def tally_of(
     sketch = np.zeros((axes.n_sketches, BUCKETS), np.int64)
     sketch[0] = np.bincount(bucket, minlength=BUCKETS)
     for axis, (name, bounds) in enumerate(zip(axes.names, axes.bounds, strict=True)):
-        interval = np.searchsorted(bounds, columns[name][is_fine], side="right")
+        interval = axes.interval(axis, columns[name][is_fine])
         size = (len(bounds) + 1) * BUCKETS
         counts = np.bincount(interval * BUCKETS + bucket, minlength=size)
         sketch[axes.part(axis)] = counts.reshape(-1, BUCKETS)
