@@ -2,6 +2,8 @@
 
 from itertools import pairwise
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -95,6 +97,27 @@ def test_kinetic_energy_equals_quadrature_over_the_link(kind, states):
 
     mine, wanted = energies(motion)
     np.testing.assert_allclose(mine, wanted, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("kind", "shortening"), KINDS)
+def test_kinetic_energy_is_that_of_the_lagrangian(kind, shortening, states):
+    """With the chord's shortening, too."""
+    basis, plant = make(kind, shortening=shortening)
+
+    @jax.jit
+    @jax.vmap
+    def energies(m):
+        joints, rates = jax.jvp(
+            partial(reference.close, MACHINE, basis), (m.pose, m.q), (m.pose_rate, m.q_rate)
+        )
+        chain = dynamics.modal_chain(plant, m.pose, m.pose_rate, m.q, m.q_rate)
+        mine = dynamics.kinetic_energy(plant, chain, m.pose_rate, m.q, m.q_rate)
+        return mine, reference.kinetic_energy(
+            MACHINE, basis, joints, m.pose, m.q, rates, m.pose_rate, m.q_rate
+        )
+
+    mine, wanted = energies(states[0])
+    np.testing.assert_allclose(mine, wanted, rtol=1e-11)
 
 
 @pytest.mark.parametrize("kind", ["pinned_pinned", "pinned_free"])
