@@ -1,8 +1,7 @@
 """Dynamics against the Lagrangian, the multiplier form and the paper's geometry."""
 
-from itertools import pairwise
-
 from functools import partial
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
