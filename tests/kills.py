@@ -76,6 +76,7 @@ WORKING = {
     "request.json",
     "progress.npz",
     "chunks",
+    "screen",
     "cache",
 }
 OF_ONE_CALL = {"results", "git", "run_time", "compile_time"}
