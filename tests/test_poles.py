@@ -10,6 +10,7 @@ from scipy.linalg import expm
 
 from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
+from jaxmodel.laws.poles import _is_flat
 from jaxmodel.nominal_loop import nominal_loop
 from jaxmodel.prepare import design_controller, prepare
 from jaxmodel.status import OK, UNPLACEABLE
@@ -443,3 +444,12 @@ def test_assembled_poles_are_matched_to_links_and_differences_are_said():
     same = PoleReport(asked, 1.1 * asked, asked, 1.0, False, omega, omega)
     assert difference(same).startswith("The nominal link does not have them")
     assert difference(same).endswith("all of them as specified, to 2 %.")
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
+def test_estimates_in_phase_place_no_poles_whatever_their_size(size):
+    turned = np.exp(1j * np.array([0.0, 0.5e-4, 2e-4, 1.0, np.pi - 0.5e-4]))
+    np.testing.assert_array_equal(
+        _is_flat((0.3 - 2j) * np.ones(5), size * (0.3 - 2j) * turned),
+        [True, True, False, False, True],
+    )

@@ -14,6 +14,7 @@ from jaxmodel import zero_exclusion
 from jaxmodel.branch_and_bound import Cells, exclude_zeros, start_cells
 from jaxmodel.controller import with_gains
 from jaxmodel.discs import Disc, excludes_zero, interval, inverse_of
+from jaxmodel.modal_loop import law_poles, law_response
 from jaxmodel.mode_tail import bound_tail, static_rest
 from jaxmodel.sampled_loop import delayed_loop
 from jaxmodel.zero_exclusion import NEAR, prepare_exclusion, return_difference
@@ -173,6 +174,22 @@ def test_the_return_difference_is_that_of_the_eigenvalue_problem(design, law, lo
             value = np.linalg.det(return_difference(setup, cell, cell).mid)
             # images beyond the near ones are bounded, not evaluated
             np.testing.assert_allclose(value[0] / value[1], wanted, rtol=2e-4)
+
+
+def test_a_law_over_a_narrow_band_changes_by_its_slope(loop):
+    """The response's disc grows with the band, and by no more than its square beyond the slope."""
+    law, period = law_poles(loop.law), float(loop.period)
+    omega, width = 2 * np.pi * np.array([30.0, 110.0, 450.0, 2000.0]), 1e-3
+
+    def size(width):
+        band = Disc(omega, np.full(omega.shape, width))
+        return law_response(law, band, period).rad
+
+    ends = [law_response(law, Disc(omega + x, 0 * omega), period).mid for x in (-width, width)]
+    np.testing.assert_allclose(
+        size(width), np.abs(ends[1] - ends[0]) / 2, rtol=1e-3, atol=1e-9 * np.abs(ends[0]).max()
+    )
+    np.testing.assert_allclose(size(width), size(width / 2) * 2, rtol=1e-3)
 
 
 @pytest.mark.parametrize("wide", [1.0, 0.01])
