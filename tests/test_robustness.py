@@ -453,6 +453,31 @@ def test_peaks_are_those_of_singular_values(name):
     assert found == pytest.approx(-best.fun, rel=1e-6)
 
 
+def test_a_delay_shortens_margins_by_its_share():
+    """By differences, and the delay margin by as much as the delay."""
+    loop = loop_of("plain", factor=1.0)
+
+    def delayed(x):
+        plant = loop.response.plant
+        return loop.response._replace(plant=plant._replace(delay=plant.late + 0.3 + x))
+
+    def places(x):
+        one = jax.tree.map(lambda x: np.asarray(x)[None], (delayed(x), loop.modes))
+        return jax.tree.map(lambda x: x[0], find_margins(*one, MARGINS, is_fine=True))
+
+    names, step = ("phase_margin", "delay_margin"), 1e-4
+    here, high, low = places(0.0), places(step), places(-step)
+
+    @jax.jit
+    @jax.jacfwd
+    def slopes(x):
+        return jnp.stack([margin_at(delayed(x), name, here[name]) for name in names])
+
+    wanted = [(high[name].value - low[name].value) / (2 * step) for name in names]
+    np.testing.assert_allclose(slopes(0.0), wanted, rtol=1e-4)
+    assert wanted[1] == pytest.approx(-1.0, rel=1e-6) and abs(wanted[0]) > 1
+
+
 @pytest.mark.long
 def test_gradients_are_those_of_differences():
     """By gains, drive and placement of all figures."""
