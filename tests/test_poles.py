@@ -1,6 +1,7 @@
 """Pole placement: asked poles are obtained on the nominal link, gains follow in closed form."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ from scipy.linalg import expm
 
 from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
+from jaxmodel.laws.contract import acting_channels
 from jaxmodel.laws.poles import _is_flat
 from jaxmodel.nominal_loop import nominal_loop
 from jaxmodel.prepare import design_controller, prepare
@@ -453,3 +455,12 @@ def test_estimates_in_phase_place_no_poles_whatever_their_size(size):
         _is_flat((0.3 - 2j) * np.ones(5), size * (0.3 - 2j) * turned),
         [True, True, False, False, True],
     )
+
+
+def test_channels_act_where_links_and_modes_are_chosen():
+    """Of the modes that the model has."""
+    links, modes = [True, False, True], [[True, False, True], [True] * 3, [False, True, True]]
+    study = study_with(decay=[], control={"links": links, "mode_mask": modes})
+    known = SimpleNamespace(mask=np.array([[1.0, 1.0, 0.0]] * 3))
+    found = acting_channels(as_arrays(build_case(study)), known)
+    np.testing.assert_array_equal(found, [[1, 0, 0], [0, 0, 0], [0, 1, 0]])
