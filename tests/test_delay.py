@@ -19,6 +19,7 @@ from jaxmodel.return_difference import delayed
 from jaxmodel.sampled_loop import closed_loop, sampled_plant
 from jaxmodel.simulate import simulate
 from studies.engine.stability import loop_report
+from studies.errors import StudyError
 from studies.spillover.certificate import certify
 from studies.spillover.plants import ModelMismatch
 from studies.study.cases import as_arrays, build_case, build_structure
@@ -66,6 +67,12 @@ def test_a_command_that_changes_within_samples_needs_a_step_on_either_side():
     plain = Structure(substeps=3)
     assert [plain._replace(has_delay=x).plant_steps for x in (False, True)] == [3, 6]
     assert plain._replace(has_delay=True, feedback="none").plant_steps == 3
+
+
+@pytest.mark.parametrize(("delay", "more", "most"), [(4.01, 0.0, "4"), (2.5, 1.6, "1.5")])
+def test_delays_of_more_than_four_samples_are_refused(delay, more, most):
+    with pytest.raises(StudyError, match=rf"delay = {more or delay}; allowed: .* {most}\b"):
+        small(delay, more)
 
 
 def test_whole_samples_of_delay_turn_the_phase_alone():
