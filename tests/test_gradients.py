@@ -1,5 +1,7 @@
 """Gradients of the residual vibration agree with central differences, forward and reverse."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +12,9 @@ from jaxmodel.bases import find_bases
 from jaxmodel.control import pole_placement
 from jaxmodel.simulate import simulate
 from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.spec import parse_study
 from tests.documents import blocks, page
+from tests.sweeps import BASE
 from tests.test_batch import short_study
 
 
@@ -100,7 +104,23 @@ def test_bad_case_leaves_gradients_of_others_alone(reverse, point):
     np.testing.assert_array_equal(after[1], 0.0)
 
 
-@pytest.mark.long  # in short: a case with converters, by kernels, in test_batched
+def test_a_rounded_loop_has_the_derivative_of_the_smooth_one():
+    study = parse_study(BASE)
+    structure, case = build_structure(study), as_arrays(build_case(study))
+
+    def residual(structure, factor):
+        placed = case._replace(control=case.control._replace(gain_factor=factor))
+        return simulate(structure, placed).metrics.residual_rms.max()
+
+    (rounded, slope), (smooth, wanted) = (
+        jax.jit(jax.value_and_grad(partial(residual, structure._replace(is_smooth=x))))(0.5)
+        for x in (False, True)
+    )
+    assert wanted != 0 and float(slope) == pytest.approx(float(wanted), rel=1e-9)
+    assert abs(rounded / smooth - 1) > 1e-6
+
+
+@pytest.mark.long
 def test_rounded_loops_have_the_slope_of_the_smooth_loop():
     """Code of the docs: values with real converters, derivatives by smooth differences."""
     codes = blocks(page("docs/reference/python.md"), "python")

@@ -192,6 +192,30 @@ def test_a_law_over_a_narrow_band_changes_by_its_slope(loop):
     np.testing.assert_allclose(size(width), size(width / 2) * 2, rtol=1e-3)
 
 
+@pytest.mark.parametrize("image", [0, 1, -2])
+def test_the_way_of_a_command_is_its_transfer_functions(loop, image):
+    """Hold, delay, filter, amplifier and high-pass of the patches."""
+    lag, corner = 1 / (2 * np.pi * 2e3), 2 * np.pi * 5.0
+    loop = loop._replace(lag=np.array(lag), highpass=np.array(corner))
+    period, antialias = float(loop.period), float(loop.antialias)
+    omega, delay = 2 * np.pi * np.array([3.0, 110.0, 2500.0]), np.array([0.2, 0.0, 0.4])
+    point = np.zeros(3)
+    found = zero_exclusion._chain(loop, Disc(omega, point), Disc(delay, point), image)
+    s = 1j * (omega + image * 2 * np.pi / period)
+    wanted = (
+        np.exp(-s * delay * period - 1j * omega * period)
+        * (1 - np.exp(-1j * omega * period))
+        / (s * period)
+        * antialias**2
+        / (s**2 + np.sqrt(2) * antialias * s + antialias**2)
+        * s
+        / (s + corner)
+        / (1 + s * lag)
+    )
+    np.testing.assert_allclose(found.mid, wanted, rtol=1e-9)
+    np.testing.assert_allclose(found.rad, 0.0, atol=1e-9 * np.abs(wanted).max())
+
+
 @pytest.mark.parametrize("wide", [1.0, 0.01])
 def test_cells_contain_their_points(loop, wide):
     setup = prepare_exclusion(loop, LARGEST, BOX[0], BOX[2], has_tail=True)
