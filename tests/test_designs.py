@@ -223,7 +223,7 @@ def test_an_interrupted_screen_goes_on(whole, tmp_path):
     assert sorted(path.name for path in out.iterdir()) == sorted(
         [".lock", BEST, TALLY, "screen.json"]
     )
-    with pytest.raises(StudyError, match="was begun with another sweep"):
+    with pytest.raises(StudyError, match=r"was begun with another --keep \(12, now 13\)"):
         screened(out, keep=KEEP + 1)
 
 
@@ -275,8 +275,13 @@ def test_damaged_tallies_are_refused(whole, tmp_path):
     changed("value", good["value"].data * 1.01)
     changed("is_done", np.zeros(4, np.int8))
     (tmp_path / TALLY).write_bytes((out / TALLY).read_bytes()[:3000])
-    with pytest.raises(StudyError):
+    with pytest.raises(StudyError, match=r"remove it and begin again"):
         read_tally(tmp_path, done.screen)
+    for more in ({"keep": KEEP - 1}, {"by": "structural_rms[link=1][station=2]"}):
+        other = done.screen._replace(**more)  # a file of the same shape, from elsewhere
+        write_tally(tmp_path, other, done.is_done, done.tally)
+        with pytest.raises(StudyError, match="not what was written for this screen"):
+            read_tally(tmp_path, done.screen)
     write_tally(tmp_path, done.screen, done.is_done, done.tally)
     assert_same(read_tally(tmp_path, done.screen)[1], done.tally)
 

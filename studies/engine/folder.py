@@ -258,17 +258,16 @@ def make_manifest(data: dict[str, Any], modules: Iterable[str] = DECISIVE) -> di
     }
 
 
-def keep_request(file: Path, request: dict[str, Any], checked: Iterable[str], what: str) -> None:
+def keep_request(file: Path, request: dict[str, Any], checked: Mapping[str, str]) -> None:
     """Write what is asked for, or check that a folder was begun with the same.
 
     Args:
         file: where, in the folder.
         request: from `make_manifest`, and more.
-        checked: its entries that must be the same.
-        what: may have changed, in words.
+        checked: its entries that must be the same, in words.
 
     Raises:
-        StudyError: the folder was begun with something else.
+        StudyError: the folder was begun with something else, or the file is damaged.
     """
     request = json.loads(json.dumps(request))
     if file.is_file():
@@ -276,10 +275,15 @@ def keep_request(file: Path, request: dict[str, Any], checked: Iterable[str], wh
             before = read_json(file)
         except (OSError, ValueError):
             before = None
-        if not isinstance(before, dict) or any(before.get(x) != request[x] for x in checked):
-            raise StudyError(
-                f"--out {file.parent}: was begun with another {what}; name a new folder"
-            )
+        if not isinstance(before, dict):
+            raise StudyError(f"{file}: damaged; name a new folder")
+        for key, what in checked.items():
+            old, new = before.get(key), request[key]
+            if old != new:
+                values = "" if isinstance(new, dict) else f" ({old}, now {new})"
+                raise StudyError(
+                    f"--out {file.parent}: was begun with another {what}{values}; name a new folder"
+                )
         return
     with replacing(file) as temporary:
         temporary.write_text(json.dumps(request, indent=1), encoding="utf-8")
