@@ -161,7 +161,9 @@ def _best(row: np.ndarray, value: np.ndarray, keep: int, is_largest: bool) -> np
 
 
 def quantile(sketch: np.ndarray, share: float) -> float:
-    """A quantile of the values in a sketch, exact within 1 %; 0 below `LEAST`, NaN without any.
+    """A quantile of the values in a sketch, exact within 1 %, NaN without any.
+
+    It is 0 below `LEAST` and infinite in the last bucket.
 
     Args:
         sketch: numbers of values, (BUCKETS,).
@@ -171,4 +173,6 @@ def quantile(sketch: np.ndarray, share: float) -> float:
     if not total:
         return float("nan")
     bucket = np.searchsorted(np.cumsum(sketch), share * total, side="left")
-    return float(LEAST * GROWTH ** (min(bucket, BUCKETS - 1) + 0.5)) if bucket else 0.0
+    if bucket == 0:
+        return 0.0
+    return float(LEAST * GROWTH ** (bucket + 0.5)) if bucket < BUCKETS - 1 else float("inf")
