@@ -106,6 +106,8 @@ def test_quantiles_are_exact_within_one_per_cent():
     for share in (0.001, 0.1, 0.5, 0.9, 0.999):
         exact = np.quantile(value, share, method="inverted_cdf")
         assert abs(quantile(tally.sketch[0], share) / exact - 1) <= 0.0101
+        smooth = quantile(tally.sketch[0], share, is_smooth=True)
+        assert abs(smooth / exact - 1) <= (0.003 if 0.01 < share < 0.99 else 0.0201)
     for k, kind in enumerate((0.0, 1.0, 2.0)):  # intervals of an axis are designs of their own
         chosen = value[columns["kind"] == kind]
         exact = np.quantile(chosen, 0.5, method="inverted_cdf")

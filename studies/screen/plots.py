@@ -66,7 +66,7 @@ def influence(done: ScreenOutcome) -> Figure:
         style = "o" if len(labels) else "-"
         for (share, text), color in zip(curves, figures.SERIES, strict=False):
             at = 1 - share if is_largest else share
-            curve = [factor * quantile(counts, at) for counts in part]
+            curve = [factor * quantile(counts, at, is_smooth=True) for counts in part]
             ax.plot(centers, curve, style, color=color, lw=1.2, label=text)
         own = field_unit(name.partition("[")[0])
         ax.set_xlabel(name if own == "1" else f"{name}\n[{own}]")
