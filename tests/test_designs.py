@@ -448,6 +448,8 @@ def test_the_command(tmp_path, capsys):
     text = capsys.readouterr().out
     again = f"studies sweep {quote(str(out / BEST))} --out DIR"
     assert "the best 5 by" in text and again in text
+    with pytest.raises(StudyError, match="holds a screen.*studies sweep '.*best.toml'"):
+        read_sweep(out)
     assert again in html.unescape((out / "report.html").read_text())
     with pytest.raises(SystemExit) as ended:
         main(["screen", str(file), "--out", str(out), "--keep", "5"])

@@ -19,6 +19,7 @@ from contextlib import contextmanager, suppress
 from hashlib import file_digest
 from io import BytesIO
 from pathlib import Path
+from shlex import quote
 from typing import Any, NamedTuple
 
 import h5py
@@ -296,7 +297,7 @@ def resumable(out: Path) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         if out.exists():
-            text = f"studies: finished work is safe; continue with --resume --out {out}"
+            text = f"studies: finished work is safe; continue with --resume --out {quote(str(out))}"
             print(text, file=sys.stderr)
         raise
 
@@ -321,6 +322,11 @@ def read_manifest(path: Path) -> dict[str, Any]:
         if os.path.isfile(path / TUNING):  # false for a name too long, too
             raise StudyError(
                 f"{path}: holds a tuning, not a sweep; see its report.html, or tune.h5 with xarray"
+            ) from None
+        if os.path.isfile(path / SCREENS.mark):
+            raise StudyError(
+                f"{path}: holds a screen, not a sweep; run its best designs first: studies sweep "
+                f"{quote(str(path / 'best.toml'))} --out DIR"
             ) from None
         raise StudyError(f"{path}: not the folder of a sweep ({MANIFEST} is missing)") from None
     except ValueError as error:

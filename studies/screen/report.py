@@ -130,7 +130,7 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
             path=quote(str(folder / BEST)),
             best=BEST,
             screen=screen,
-            summary=summary_lines(done),
+            summary=[line[0].upper() + line[1:] for line in summary_lines(done)],
             drawn=list(drawings),
             endings=ending_rows(done),
             quantiles=quantile_rows(done),
