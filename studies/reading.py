@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import errno
 import json
+import mmap
 import os
 import stat
+import struct
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -29,6 +31,8 @@ DEEPEST = 64
 _EXACT = 18
 #: What compression can save [1], and what a dataset may take without any storage [bytes].
 _PACKED, _SPARE = 1100, 2**20
+#: How a collection of texts begins in an HDF5 file (its specification, section III.E).
+_HEAP = b"GCOL\x01\0\0\0"
 
 
 @contextmanager
@@ -192,12 +196,29 @@ def open_hdf5(path: Path) -> Iterator[h5py.File]:
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
+        if size:
+            _check_heaps(file)
     with h5py.File(path, "r") as opened:
         try:
             _check_group(opened, _PACKED * size + _SPARE, set(), 0)
             yield opened
         except (RuntimeError, KeyError) as error:  # h5py's, for a damaged or missing part
             raise ValueError(str(error)) from None
+
+
+def _check_heaps(file: BufferedReader) -> None:
+    """Raise ValueError for texts of an HDF5 file whose sizes make HDF5 walk them without end."""
+    with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        first = content.find(_HEAP)
+        while first >= 0:
+            at, stop = first + 16, first + int.from_bytes(content[first + 8 : first + 16], "little")
+            while at + 16 <= min(stop, len(content)):
+                number, _, _, length = struct.unpack("<HHIQ", content[at : at + 16])
+                step = 16 + -(-length // 8) * 8 if number else length  # 0: the free rest
+                if not 0 < step <= stop - at:
+                    raise ValueError("its texts have sizes that do not fit")
+                at += step
+            first = content.find(_HEAP, first + 1)
 
 
 def _check_group(group: h5py.Group, most: int, seen: set[int], depth: int) -> None:

@@ -1,8 +1,12 @@
 """`studies screen`: tallies, designs made shard by shard, and going on after interruptions."""
 
+import html
 import re
 import threading
+import warnings
+from shlex import quote
 
+import jax
 import numpy as np
 import pytest
 
@@ -11,7 +15,7 @@ from studies.cli import main
 from studies.engine.results import metric_values, read_sweep
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
-from studies.screen.report import summary_lines, write_screen_report
+from studies.screen.report import quantile_rows, summary_lines, write_screen_report
 from studies.screen.run import LocalScreener, run_screen
 from studies.screen.shards import screen_of
 from studies.screen.stored import BEST, TALLY, read_tally, write_tally
@@ -102,6 +106,8 @@ def test_quantiles_are_exact_within_one_per_cent():
     for share in (0.001, 0.1, 0.5, 0.9, 0.999):
         exact = np.quantile(value, share, method="inverted_cdf")
         assert abs(quantile(tally.sketch[0], share) / exact - 1) <= 0.0101
+        smooth = quantile(tally.sketch[0], share, is_smooth=True)
+        assert abs(smooth / exact - 1) <= (0.003 if 0.01 < share < 0.99 else 0.0201)
     for k, kind in enumerate((0.0, 1.0, 2.0)):  # intervals of an axis are designs of their own
         chosen = value[columns["kind"] == kind]
         exact = np.quantile(chosen, 0.5, method="inverted_cdf")
@@ -109,8 +115,9 @@ def test_quantiles_are_exact_within_one_per_cent():
         assert counts.sum() == len(chosen)
         assert abs(quantile(counts, 0.5) / exact - 1) <= 0.0101
     assert np.isnan(quantile(np.zeros(10, int), 0.5))
-    zeros = tally_of(row, code, 0 * value, columns, axes, 10, False)
-    assert quantile(zeros.sketch[0], 0.5) == 0
+    for factor, expected in ((0, 0), (-1, 0), (1e30, np.inf)):
+        beyond = tally_of(row, code, factor * value, columns, axes, 10, False)
+        assert quantile(beyond.sketch[0], 0.5) == expected
 
 
 # --- designs --------------------------------------------------------------------------------------
@@ -223,7 +230,7 @@ def test_an_interrupted_screen_goes_on(whole, tmp_path):
     assert sorted(path.name for path in out.iterdir()) == sorted(
         [".lock", BEST, TALLY, "screen.json"]
     )
-    with pytest.raises(StudyError, match="was begun with another sweep"):
+    with pytest.raises(StudyError, match=r"was begun with another --keep \(12, now 13\)"):
         screened(out, keep=KEEP + 1)
 
 
@@ -275,8 +282,13 @@ def test_damaged_tallies_are_refused(whole, tmp_path):
     changed("value", good["value"].data * 1.01)
     changed("is_done", np.zeros(4, np.int8))
     (tmp_path / TALLY).write_bytes((out / TALLY).read_bytes()[:3000])
-    with pytest.raises(StudyError):
+    with pytest.raises(StudyError, match=r"remove it and begin again"):
         read_tally(tmp_path, done.screen)
+    for more in ({"keep": KEEP - 1}, {"by": "structural_rms[link=1][station=2]"}):
+        other = done.screen._replace(**more)  # a file of the same shape, from elsewhere
+        write_tally(tmp_path, other, done.is_done, done.tally)
+        with pytest.raises(StudyError, match="not what was written for this screen"):
+            read_tally(tmp_path, done.screen)
     write_tally(tmp_path, done.screen, done.is_done, done.tally)
     assert_same(read_tally(tmp_path, done.screen)[1], done.tally)
 
@@ -306,6 +318,8 @@ def test_what_a_screen_cannot_do_is_refused():
         screen_of(SPEC, by="structural_rms[link=4]")
     with pytest.raises(StudyError, match="--keep = 0"):
         screen_of(SPEC, keep=0)
+    with jax.enable_x64(False), pytest.raises(StudyError, match="--by = 'residual_rms'.*float32"):
+        screen_of(SPEC, by="residual_rms")
 
 
 def test_slow_axes_of_a_grid_are_seen():
@@ -389,6 +403,32 @@ def test_nothing_is_kept_where_no_design_ends_well(tmp_path, capsys):
     )
 
 
+def test_a_report_of_values_that_a_log_scale_lacks(whole, tmp_path):
+    """Negative values and zeros have no figures; where the largest are the best, so are shares."""
+    _, done = whole
+    sketch = np.zeros_like(done.tally.sketch)
+    sketch[:, 0] = done.tally.sketch.sum(axis=1)
+    tally = done.tally._replace(value=done.tally.value - 1, sketch=sketch)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        write_screen_report(tmp_path, done._replace(tally=tally))
+    assert not list(tmp_path.glob("*.png"))
+    assert summary_lines(done._replace(tally=tally))[1].endswith("median of all: 0 µm or less")
+    largest = done._replace(screen=done.screen._replace(by=f"-{done.screen.by}"))
+    assert [share for share, _ in quantile_rows(largest)] == ["1 %", "10 %", "50 %", "90 %"]
+    least, most = quantile_rows(done), quantile_rows(largest)
+    assert least[-1][1].replace("less", "more") == most[1][1]  # 90 % are below, 10 % above
+
+
+def test_designs_without_a_value_are_counted(whole):
+    """Such as by a mode that they lack; they are ok, but nothing ranks them."""
+    _, done = whole
+    without = done._replace(tally=done.tally._replace(sketch=0 * done.tally.sketch))
+    count = done.tally.endings[status.OK]
+    assert f"{count} of those that are ok have no finite" in summary_lines(without)[1]
+    assert "no finite" not in "".join(summary_lines(done))
+
+
 def test_report_says_what_was_found(whole):
     out, done = whole
     write_screen_report(out, done)
@@ -402,11 +442,15 @@ def test_report_says_what_was_found(whole):
 def test_the_command(tmp_path, capsys):
     from studies.study.template import toml_text
 
-    file, out = tmp_path / "sweep.toml", tmp_path / "out"
+    file, out = tmp_path / "sweep.toml", tmp_path / "it's a screen"
     file.write_text(toml_text(small(SWEEP)))
     main(["screen", str(file), "--out", str(out), "--keep", "5"])
     text = capsys.readouterr().out
-    assert "the best 5 by" in text and f"studies sweep {out / BEST}" in text
+    again = f"studies sweep {quote(str(out / BEST))} --out DIR"
+    assert "the best 5 by" in text and again in text
+    with pytest.raises(StudyError, match="holds a screen.*studies sweep '.*best.toml'"):
+        read_sweep(out)
+    assert again in html.unescape((out / "report.html").read_text())
     with pytest.raises(SystemExit) as ended:
         main(["screen", str(file), "--out", str(out), "--keep", "5"])
     assert ended.value.code == 2

@@ -7,6 +7,7 @@ import io
 import json
 import os
 import shutil
+import struct
 import sys
 import time
 
@@ -190,6 +191,23 @@ def test_hdf5_files_keep_their_data_themselves(tmp_path, make):
         make(file, tmp_path)
     refused = pytest.raises(ValueError, match="'x' (is a link|keeps its data|declares more)")
     with refused, open_hdf5(tmp_path / "x.h5"):
+        pass
+
+
+@pytest.mark.parametrize("length", [0, 2**64 - 16])
+def test_texts_without_end_are_refused(tmp_path, length):
+    """HDF5 adds the lengths of a heap's texts until it is at its end, and never gets there."""
+    path = tmp_path / "x.h5"
+    with h5py.File(path, "w") as file:
+        file["x"] = ["some", "texts"]
+    good = path.read_bytes()
+    with open_hdf5(path) as file:
+        assert file["x"].asstr()[()].tolist() == ["some", "texts"]
+    first = good.index(b"GCOL") + 16
+    number = min(length, 1)  # 0: free room
+    text = struct.pack("<HHIQ", number, 1, 0, length)
+    path.write_bytes(good[:first] + text + good[first + 16 :])
+    with pytest.raises(ValueError, match="do not fit"), open_hdf5(path):
         pass
 
 

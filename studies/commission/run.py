@@ -84,8 +84,8 @@ def run_commission(
     with locked_folder(out, "commissioning"):
         refuse_existing(out, COMMISSIONINGS, is_resumed)
         request = make_manifest(measured.data, DECISIVE) | {"files": measured.data_files()}
-        checked = "spec", "code", "files"
-        keep_request(out / COMMISSIONINGS.mark, request, checked, "file, data or program")
+        checked = {"spec": "file", "code": "program", "files": "data"}
+        keep_request(out / COMMISSIONINGS.mark, request, checked)
         outcome = _outcome(measured, out, console)
         with publish(out) as staging:
             (staging / DOCUMENT).write_text(document(measured, outcome), encoding="utf-8")

@@ -19,6 +19,7 @@ from contextlib import contextmanager, suppress
 from hashlib import file_digest
 from io import BytesIO
 from pathlib import Path
+from shlex import quote
 from typing import Any, NamedTuple
 
 import h5py
@@ -258,17 +259,16 @@ def make_manifest(data: dict[str, Any], modules: Iterable[str] = DECISIVE) -> di
     }
 
 
-def keep_request(file: Path, request: dict[str, Any], checked: Iterable[str], what: str) -> None:
+def keep_request(file: Path, request: dict[str, Any], checked: Mapping[str, str]) -> None:
     """Write what is asked for, or check that a folder was begun with the same.
 
     Args:
         file: where, in the folder.
         request: from `make_manifest`, and more.
-        checked: its entries that must be the same.
-        what: may have changed, in words.
+        checked: its entries that must be the same, in words.
 
     Raises:
-        StudyError: the folder was begun with something else.
+        StudyError: the folder was begun with something else, or the file is damaged.
     """
     request = json.loads(json.dumps(request))
     if file.is_file():
@@ -276,10 +276,15 @@ def keep_request(file: Path, request: dict[str, Any], checked: Iterable[str], wh
             before = read_json(file)
         except (OSError, ValueError):
             before = None
-        if not isinstance(before, dict) or any(before.get(x) != request[x] for x in checked):
-            raise StudyError(
-                f"--out {file.parent}: was begun with another {what}; name a new folder"
-            )
+        if not isinstance(before, dict):
+            raise StudyError(f"{file}: damaged; name a new folder")
+        for key, what in checked.items():
+            old, new = before.get(key), request[key]
+            if old != new:
+                values = "" if isinstance(new, dict) else f" ({old}, now {new})"
+                raise StudyError(
+                    f"--out {file.parent}: was begun with another {what}{values}; name a new folder"
+                )
         return
     with replacing(file) as temporary:
         temporary.write_text(json.dumps(request, indent=1), encoding="utf-8")
@@ -292,7 +297,7 @@ def resumable(out: Path) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         if out.exists():
-            text = f"studies: finished work is safe; continue with --resume --out {out}"
+            text = f"studies: finished work is safe; continue with --resume --out {quote(str(out))}"
             print(text, file=sys.stderr)
         raise
 
@@ -317,6 +322,11 @@ def read_manifest(path: Path) -> dict[str, Any]:
         if os.path.isfile(path / TUNING):  # false for a name too long, too
             raise StudyError(
                 f"{path}: holds a tuning, not a sweep; see its report.html, or tune.h5 with xarray"
+            ) from None
+        if os.path.isfile(path / SCREENS.mark):
+            raise StudyError(
+                f"{path}: holds a screen, not a sweep; run its best designs first: studies sweep "
+                f"{quote(str(path / 'best.toml'))} --out DIR"
             ) from None
         raise StudyError(f"{path}: not the folder of a sweep ({MANIFEST} is missing)") from None
     except ValueError as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -47,17 +47,27 @@ def kept_metrics(spec: SweepSpec) -> list[str]:
             hint = nearest(name, METRICS)
             raise field_error("sweep.metrics", name, ", ".join(METRICS), hint=hint)
     kept = list(spec.sweep.metrics or METRICS)
-    single = [name for name, metric in METRICS.items() if metric.is_single]
-    lost = [name for name in kept if name not in single]
-    if lost and jax.dtypes.canonicalize_dtype(np.float64) == np.float32:
-        written = lost if spec.sweep.metrics else []
+    lost = inaccurate(kept)
+    if lost:
         raise field_error(
             "sweep.metrics",
-            written,
-            f"with float32 a list of {', '.join(single)}, which it has within 1 %; "
-            "leave --precision out for the others",
+            lost if spec.sweep.metrics else [],
+            f"with float32 a list of {accurate()}",
         )
     return kept
+
+
+def inaccurate(names: Iterable[str]) -> list[str]:
+    """Those of some metrics that are too inaccurate in the working precision."""
+    if jax.dtypes.canonicalize_dtype(np.float64) != np.float32:
+        return []
+    return [name for name in names if not METRICS[name].is_single]
+
+
+def accurate() -> str:
+    """Metrics that single precision has, for messages."""
+    single = ", ".join(name for name, metric in METRICS.items() if metric.is_single)
+    return f"{single}, which it has within 1 %; leave --precision out for the others"
 
 
 def chunk_arrays(table: CaseTable, done: Done, kept: list[str]) -> dict[str, np.ndarray]:

@@ -88,8 +88,9 @@ def run_laws(
     with locked_folder(out, "comparison"):
         refuse_existing(out, COMPARISONS, is_resumed)
         request = make_manifest(study.model_dump(mode="json"), DECISIVE) | budget._asdict()
-        checked = "spec", "code", *Budget._fields
-        keep_request(out / COMPARISONS.mark, request, checked, "design, budget or program")
+        limits = dict.fromkeys(Budget._fields, "budget")
+        checked = {"spec": "design", "code": "program"} | limits
+        keep_request(out / COMPARISONS.mark, request, checked)
         names = ("tune", *sweep_phases(_empty_sweep(study)), "rank", "draw")
         with Phases(console, names, is_quiet) as phases:
             return _compare(study, out, budget, phases)

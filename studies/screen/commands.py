@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from enum import StrEnum
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -54,12 +55,13 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
         Writes best.toml, a sweep of the kept designs; run it to judge them by the full model.
         """
-        from studies.engine.folder import SCREENS, refuse_existing
+        from studies.engine.folder import SCREENS, refuse_existing, resumable
 
         workers = Workers(scheduler, local_workers, worker_timeout)
         refuse_existing(out, SCREENS, resume)
         start(precision, gpu=not workers.are_named)
         from studies.engine.progress import Phases
+        from studies.extensions import options
         from studies.screen.report import summary_lines, write_screen_report
         from studies.screen.run import PHASES, run_screen
         from studies.screen.shards import screen_of
@@ -73,14 +75,17 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
             return ClusterScreener(client, worker_timeout)
 
-        with Phases(console, PHASES, quiet) as phases:
+        with resumable(out), Phases(console, PHASES, quiet) as phases:
             with on_workers(workers, phases.say, make) as screener:
                 done = run_screen(asked, out, screener=screener, phases=phases)
             if not done.is_interrupted:
                 phases.begin("report")
                 write_screen_report(out, done)
-        asks = f"--by={asked.by} --keep {keep} --fidelity {fidelity} --precision {precision}"
-        again = f"studies screen {spec} --out {out} {asks} --resume{workers.options}"
+        asks = f"--by={quote(asked.by)} --keep {keep} --fidelity {fidelity} --precision {precision}"
+        again = (
+            f"studies {options()}screen {quote(str(spec))} --out {quote(str(out))} {asks} --resume"
+            f"{workers.options}"
+        )
         if done.is_interrupted:
             print(
                 f"studies: interrupted; {done.tally.n_designs} of {asked.n_designs} designs are "
@@ -93,7 +98,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
                 console.print(line, soft_wrap=True)
             if len(done.tally.row):
                 console.print(
-                    f"the full model of the best: studies sweep {out / BEST} --out DIR",
+                    f"the full model of the best: studies {options()}sweep "
+                    f"{quote(str(out / BEST))} --out DIR",
                     soft_wrap=True,
                 )
             announce(console, out / REPORT)

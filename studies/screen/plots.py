@@ -26,11 +26,18 @@ def values(done: ScreenOutcome) -> Figure:
     unit = METRICS[done.screen.metric].unit
     factor = readable(unit)[0]
     seen = np.flatnonzero(counts)
-    middle = factor * LEAST * GROWTH ** (np.arange(BUCKETS) + 0.5)
+    edges = factor * LEAST * GROWTH ** np.arange(BUCKETS + 1)
     figure, axes = figures.one_panel(2.6)
     part = slice(seen[0], seen[-1] + 1)
-    axes.fill_between(middle[part], counts[part], step="mid", color=figures.SERIES[0], alpha=0.6)
-    axes.axvline(factor * done.tally.value[-1], color=figures.SERIES[1], lw=1.2)
+    axes.stairs(
+        counts[part],
+        edges[seen[0] : seen[-1] + 2],
+        fill=True,
+        color=figures.SERIES[0],
+        alpha=0.6,
+    )
+    last = factor * np.clip(done.tally.value[-1], LEAST, LEAST * GROWTH**BUCKETS)
+    axes.axvline(last, color=figures.SERIES[1], lw=1.2)
     axes.set(xlabel=headed(done.screen.entry, unit), ylabel="designs")
     figures.log_scale(axes, "x")
     if counts[part].max() > 100:
@@ -47,15 +54,19 @@ def influence(done: ScreenOutcome) -> Figure:
     count = len(screen.axes.names)
     figure, axes = figures.new_figure(-(-count // ACROSS), min(count, ACROSS), 1.9, False)
     panels = list(axes.flat)
+    most = max(len(centers) for centers in screen.axes.centers)
+    total = done.tally.sketch[0].sum()
+    # a share of less than one design an interval is the best one there, whatever its name
+    curves = [curve for curve in CURVES if curve[0] * total >= most] or CURVES[:1]
     for ax in panels[len(screen.axes.names) :]:
         ax.set_visible(False)
     for k, (ax, name) in enumerate(zip(panels, screen.axes.names, strict=False)):
         part = done.tally.sketch[screen.axes.part(k)]
         centers, labels = screen.axes.centers[k], screen.axes.labels[k]
         style = "o" if len(labels) else "-"
-        for (share, text), color in zip(CURVES, figures.SERIES, strict=False):
+        for (share, text), color in zip(curves, figures.SERIES, strict=False):
             at = 1 - share if is_largest else share
-            curve = [factor * quantile(counts, at) for counts in part]
+            curve = [factor * quantile(counts, at, is_smooth=True) for counts in part]
             ax.plot(centers, curve, style, color=color, lw=1.2, label=text)
         own = field_unit(name.partition("[")[0])
         ax.set_xlabel(name if own == "1" else f"{name}\n[{own}]")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from matplotlib.figure import Figure
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
+from studies.extensions import options
 from studies.publish import REPORT, publish
 from studies.screen.margins import JUDGED
 from studies.screen.plots import influence, values
@@ -55,11 +57,16 @@ def ending_rows(done: ScreenOutcome) -> list[tuple[str, str, str]]:
 
 
 def quantile_rows(done: ScreenOutcome) -> list[tuple[str, str]]:
-    """Quantiles of the metric over all designs that ended well, exact within 1 %."""
-    sketch = done.tally.sketch[0]
+    """Quantiles of the metric over all designs that ended well, best first, exact within 1 %."""
+    sketch, is_largest = done.tally.sketch[0], done.screen.ranking[1]
+    bound = "more" if is_largest else "less"
     return [
-        (f"{100 * share:g} %", f"{quantity(done, quantile(sketch, share))} or less")
+        (
+            f"{100 * share:g} %",
+            f"{quantity(done, quantile(sketch, 1 - share if is_largest else share))} or {bound}",
+        )
         for share in SHARES
+        if share * sketch.sum() >= 1
     ]
 
 
@@ -70,10 +77,14 @@ def summary_lines(done: ScreenOutcome) -> list[str]:
         f"{tally.n_designs} designs: "
         + "; ".join(f"{number} {reason}" for number, _, reason in ending_rows(done))
     ]
+    n_without = int(tally.endings[status.OK] - tally.sketch[0].sum())
+    if n_without:
+        lines.append(f"{n_without} of those that are ok have no finite {screen.entry}")
     if not len(tally.row):
-        return [*lines, "no design ended well; nothing is kept"]
+        return [*lines, "nothing is kept" if n_without else "no design ended well; nothing is kept"]
     best, last = (quantity(done, tally.value[k]) for k in (0, -1))
     half = quantity(done, quantile(tally.sketch[0], 0.5))
+    half += " or less" if tally.value.min() < 0 else ""  # negative values count as 0
     lines.append(
         f"the best {len(tally.row)} by {screen.entry}: {best} to {last}; median of all: {half}"
     )
@@ -100,10 +111,10 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
     """
     screen, tally = done.screen, done.tally
     drawings: dict[str, Callable[[ScreenOutcome], Figure]] = {}
-    if len(tally.row):
+    if tally.sketch[0, 1:].any():  # what is drawn on a log scale
         drawings[VALUES] = values
-    if len(tally.row) and screen.axes.names:
-        drawings[INFLUENCE] = influence
+        if screen.axes.names:
+            drawings[INFLUENCE] = influence
     rows = _best_rows(done) if len(tally.row) else []
     with publish(folder, stale=(VALUES, INFLUENCE)) as staging:
         with styled():
@@ -115,10 +126,11 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
             {"Sweep file": toml_text(screen.spec.data)},
             about=screen.spec.study,
             title=screen.spec.study.title,
-            folder=str(folder),
+            command=f"studies {options()}",
+            path=quote(str(folder / BEST)),
             best=BEST,
             screen=screen,
-            summary=summary_lines(done),
+            summary=[line[0].upper() + line[1:] for line in summary_lines(done)],
             drawn=list(drawings),
             endings=ending_rows(done),
             quantiles=quantile_rows(done),

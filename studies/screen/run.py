@@ -21,6 +21,7 @@ from studies.screen.margins import kept_margins
 from studies.screen.shards import ScreenRequest, shard_tally
 from studies.screen.stored import begin, write_best, write_tally
 from studies.screen.tally import LEFT_OUT, Tally, merged
+from studies.show.units import count_text
 from studies.space.table import CaseTable, build_table
 
 T = TypeVar("T")
@@ -155,7 +156,9 @@ def run_screen(
     with locked_folder(out, "screen"), interrupts() as stop:
         is_done, tally = begin(out, screen)
         left = np.flatnonzero(~is_done).tolist()
-        phases.begin("screen", f"{screen.n_designs:,} designs in {screen.n_shards} shards")
+        phases.begin(
+            "screen", f"{screen.n_designs:,} designs in {count_text(screen.n_shards, 'shard')}"
+        )
         progress = ScreenProgress(phases, screen.n_designs, tally.n_designs)
         for shard, answer in screener.tallies(screen, left, progress, stop):
             if isinstance(answer, str):

@@ -15,7 +15,7 @@ from studies.engine.columns import labelled
 from studies.engine.plan import local_layout, most_lanes, plan_groups
 from studies.engine.progress import Phases, Reporter
 from studies.engine.results import SweepData, direction, metric_values
-from studies.engine.stored import chunk_arrays
+from studies.engine.stored import accurate, chunk_arrays, inaccurate
 from studies.errors import StudyError, field_error
 from studies.screen.tally import Axes, Tally, divided, merged, nothing, tally_of
 from studies.space.axes import LIMIT
@@ -115,6 +115,8 @@ def screen_of(
             "narrow the axes to where it holds"
         )
     parse_entries(by.removeprefix("-"), "--by", metric_sizes(table))
+    if inaccurate([by.removeprefix("-").partition("[")[0]]):
+        raise field_error("--by", by, f"with float32 {accurate()}")
     return ScreenRequest(
         spec=spec,
         by=by,

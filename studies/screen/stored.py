@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,16 @@ from studies.study.template import toml_text, toml_value
 
 REQUEST, TALLY, BEST = "screen.json", "screen.h5", "best.toml"
 #: What must be the same in a folder that is gone on with.
-_CHECKED = ("spec", "by", "keep", "fidelity", "shard_size", "code", "precision", "jaxlib")
+_CHECKED = {
+    "spec": "sweep",
+    "by": "--by",
+    "keep": "--keep",
+    "fidelity": "--fidelity",
+    "shard_size": "size of shards",
+    "code": "program",
+    "precision": "--precision",
+    "jaxlib": "version of jaxlib",
+}
 #: Fields of a sweep that say which designs there are; `best.toml` names its cases instead.
 _SPREADING = {"method", "axes", "blocks", "cases", "count", "size", "levels", "where", "seed"}
 
@@ -37,14 +47,8 @@ def begin(folder: Path, screen: ScreenRequest) -> tuple[np.ndarray, Tally]:
     Raises:
         StudyError: the folder was begun with another screen, or its file is damaged.
     """
-    request = {
-        **make_manifest(screen.spec.data, ("studies.screen.shards",)),
-        "by": screen.by,
-        "keep": screen.keep,
-        "fidelity": screen.spec.sweep.fidelity,
-        "shard_size": screen.shard_size,
-    }
-    keep_request(folder / REQUEST, request, _CHECKED, "sweep, metric, number, code or precision")
+    request = make_manifest(screen.spec.data, ("studies.screen.shards",)) | _asked(screen)
+    keep_request(folder / REQUEST, request, _CHECKED)
     if not (folder / TALLY).is_file():
         return np.zeros(screen.n_shards, bool), nothing(screen.axes)
     return read_tally(folder, screen)
@@ -53,12 +57,12 @@ def begin(folder: Path, screen: ScreenRequest) -> tuple[np.ndarray, Tally]:
 def read_tally(folder: Path, screen: ScreenRequest) -> tuple[np.ndarray, Tally]:
     """Which shards of a screen are done, and their tally; errors as `begin`."""
     path, empty = folder / TALLY, nothing(screen.axes)
-    variables, attributes = read_store(path)
     try:
+        variables, attributes = read_store(path)
         is_done = variables["is_done"].data > 0
         tally = Tally(**{name: variables[name].data for name in Tally._fields})
-    except (KeyError, TypeError) as error:
-        raise _damaged(path, str(error)) from None
+    except (StudyError, KeyError, TypeError) as error:
+        raise _damaged(path, str(error).removeprefix(f"{path}: ")) from None
     if is_done.shape != (screen.n_shards,):
         raise _damaged(path, "number of shards")
     for name, array in tally._asdict().items():
@@ -75,16 +79,27 @@ def read_tally(folder: Path, screen: ScreenRequest) -> tuple[np.ndarray, Tally]:
         or tally.n_designs != n_done
     ):
         raise _damaged(path, "numbers of designs")
-    if attributes.get("digest") != _digest(is_done, tally):
-        raise _damaged(path, "not what was written")
+    if attributes.get("digest") != _digest(screen, is_done, tally):
+        raise _damaged(path, "not what was written for this screen")
     is_row = (tally.row >= 0) & (tally.row < screen.n_designs)
     if tally.row.shape != tally.value.shape or len(tally.row) > screen.keep or not is_row.all():
         raise _damaged(path, "designs kept")
     return is_done, tally
 
 
-def _digest(is_done: np.ndarray, tally: Tally) -> str:
-    return numbers_digest({"is_done": is_done, **tally._asdict()})
+def _asked(screen: ScreenRequest) -> dict[str, Any]:
+    """What is asked of a screen, next to its sweep."""
+    return {
+        "by": screen.by,
+        "keep": screen.keep,
+        "fidelity": screen.spec.sweep.fidelity,
+        "shard_size": screen.shard_size,
+    }
+
+
+def _digest(screen: ScreenRequest, is_done: np.ndarray, tally: Tally) -> str:
+    asked = json.dumps({"spec": screen.spec.data, **_asked(screen)}, sort_keys=True)
+    return numbers_digest({"is_done": is_done, "asked": asked, **tally._asdict()})
 
 
 def _damaged(path: Path, what: str) -> StudyError:
@@ -115,7 +130,7 @@ def write_tally(folder: Path, screen: ScreenRequest, is_done: np.ndarray, tally:
         "title": screen.spec.study.title,
         "by": screen.by,
         "n_designs": screen.n_designs,
-        "digest": _digest(is_done, tally),
+        "digest": _digest(screen, is_done, tally),
     }
     write_store(folder / TALLY, variables, attributes)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, TypeAlias
 
 import typer
@@ -98,13 +99,16 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if len(done.lost):
             print(
                 f"studies: {len(done.lost)} of {len(done.table)} cases were left out, see above; "
-                f"retry them with --resume --out {out}",
+                f"retry them with --resume --out {quote(str(out))}",
                 file=sys.stderr,
             )
         if done.is_interrupted:
+            from studies.extensions import options
+
             print(
                 f"studies: interrupted; {done.n_done} of {len(done.table)} cases are safe; "
-                f"continue with: studies sweep {spec} --out {out} --resume{workers.options}",
+                f"continue with: studies {options()}sweep {quote(str(spec))} --out "
+                f"{quote(str(out))} --resume{workers.options}",
                 file=sys.stderr,
             )
             sys.exit(130)
