@@ -13,6 +13,7 @@ import pytest
 from jaxmodel import status
 from studies.cli import main
 from studies.engine.results import metric_values, read_sweep
+from studies.engine.runs import run_uncontrolled
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.screen.report import quantile_rows, summary_lines, write_screen_report
@@ -201,7 +202,7 @@ def test_kept_designs_have_the_margins_of_the_sweep(whole, tmp_path):
     data = read_sweep(tmp_path / "sweep")
     np.testing.assert_allclose(done.margin, data["gain_margin"], rtol=1e-9)
     lines = summary_lines(done)
-    assert f"of the best {KEEP}, {np.sum(done.margin < 1)} are unstable" in lines[2]
+    assert f"of the best {KEEP}, {np.sum(done.margin < 1)} are unstable" in lines[3]
 
 
 class Stopped(LocalScreener):
@@ -436,6 +437,12 @@ def test_report_says_what_was_found(whole):
     assert "200 designs" in text and "actuators saturated" in text and "best.toml" in text
     lines = summary_lines(done)
     assert lines[1].startswith(f"the best {KEEP} by structural_rms[link=2][station=2]")
+    alone = run_uncontrolled(SPEC.study, is_linear=True).result.metrics.structural_rms[1, 1]
+    assert done.uncontrolled == pytest.approx(float(alone), rel=1e-9)
+    assert lines[2].startswith("structural_rms[link=2][station=2] of the baseline without control:")
+    worse = done._replace(uncontrolled=0.9 * done.tally.value[0])
+    assert summary_lines(worse)[2].endswith("no design is below it")
+    assert "no design is below it" not in lines[2]
     assert {"values.png", "influence.png"} <= {path.name for path in out.iterdir()}
 
 

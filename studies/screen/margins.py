@@ -1,11 +1,16 @@
-"""Gain margins of the designs that a screen kept, which it ranked without them."""
+"""What the designs that a screen kept are judged by: gain margins, and no control at all."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from jaxmodel import status
 from studies.engine.chunks import judge_cases
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
+from studies.engine.results import SweepData, controlled, uncontrolled_value
+from studies.engine.run_data import metric_variables
+from studies.engine.runs import run_uncontrolled
+from studies.errors import StudyError
 from studies.screen.shards import ScreenRequest, designs_table
 
 #: Designs that are judged, best first.
@@ -35,3 +40,28 @@ def kept_margins(screen: ScreenRequest, row: np.ndarray) -> np.ndarray:
             margin[chunk.rows] = np.asarray(figures.gain_margin)[: len(chunk.rows)]
     found[: len(judged)][np.isin(judged, table.row)] = margin
     return found
+
+
+def uncontrolled(screen: ScreenRequest, row: np.ndarray) -> float | None:
+    """What the designs are ranked by, of the study's machine without control.
+
+    Args:
+        screen: of the designs.
+        row: their numbers, best first, (n,).
+
+    Returns:
+        Value [unit of the metric]; None where there is nothing to compare, or no such run.
+    """
+    if not len(row):
+        return None
+    table = designs_table(screen, row[:JUDGED])
+    if not controlled(table).any():
+        return None
+    try:
+        run = run_uncontrolled(screen.spec.study, is_linear=screen.spec.sweep.fidelity == "linear")
+    except StudyError:
+        return None
+    if run.status not in status.FINISHED:
+        return None
+    data = SweepData({}, {}, screen.spec, table, metric_variables(run.result))
+    return uncontrolled_value(data, screen.entry)

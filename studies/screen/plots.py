@@ -36,8 +36,13 @@ def values(done: ScreenOutcome) -> Figure:
         color=figures.SERIES[0],
         alpha=0.6,
     )
-    last = factor * np.clip(done.tally.value[-1], LEAST, LEAST * GROWTH**BUCKETS)
-    axes.axvline(last, color=figures.SERIES[1], lw=1.2)
+    for value, color, style in (
+        (done.tally.value[-1], figures.SERIES[1], "-"),
+        (done.uncontrolled, figures.SERIES[4], "--"),
+    ):
+        if value is not None:
+            at = factor * np.clip(value, LEAST, LEAST * GROWTH**BUCKETS)
+            axes.axvline(at, color=color, linestyle=style, lw=1.2)
     axes.set(xlabel=headed(done.screen.entry, unit), ylabel="designs")
     figures.log_scale(axes, "x")
     if counts[part].max() > 100:

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
+from studies.engine.results import ROUNDING
 from studies.extensions import options
 from studies.publish import REPORT, publish
 from studies.screen.margins import JUDGED
@@ -88,6 +89,7 @@ def summary_lines(done: ScreenOutcome) -> list[str]:
     lines.append(
         f"the best {len(tally.row)} by {screen.entry}: {best} to {last}; median of all: {half}"
     )
+    lines += _uncontrolled_line(done)
     margin = done.margin[~np.isnan(done.margin)]
     if not margin.size:
         return lines
@@ -101,6 +103,19 @@ def summary_lines(done: ScreenOutcome) -> list[str]:
         value, text = quantity(done, tally.value[first]), margin_text(done.margin[first])
         lines.append(f"the best of these: design {tally.row[first]} with {value}, margin {text}")
     return lines
+
+
+def _uncontrolled_line(done: ScreenOutcome) -> list[str]:
+    """How the best compare with no control at all."""
+    if done.uncontrolled is None:
+        return []
+    sign = -1 if done.screen.ranking[1] else 1
+    lead = sign * (done.uncontrolled - done.tally.value[0])
+    text = f"{done.screen.entry} of the baseline without control: "
+    text += quantity(done, done.uncontrolled)
+    if lead <= ROUNDING * abs(done.uncontrolled):
+        text += f"; no design is {'above' if sign < 0 else 'below'} it"
+    return [text]
 
 
 def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
@@ -144,6 +159,7 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
             rows=rows,
             is_robust=bool(np.any(done.margin > ENOUGH)),
             enough=ENOUGH,
+            is_compared=done.uncontrolled is not None,
             lost=done.lost,
         )
         (staging / REPORT).write_text(text, encoding="utf-8")

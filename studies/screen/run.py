@@ -17,7 +17,7 @@ from studies import config
 from studies.engine.folder import locked_folder
 from studies.engine.progress import Phases, duration_text
 from studies.engine.sweep import interrupts
-from studies.screen.margins import kept_margins
+from studies.screen.margins import kept_margins, uncontrolled
 from studies.screen.shards import ScreenRequest, shard_tally
 from studies.screen.stored import begin, write_best, write_tally
 from studies.screen.tally import LEFT_OUT, Tally, merged
@@ -123,6 +123,7 @@ class ScreenOutcome(NamedTuple):
     lost: dict[int, str]  # shards that were given up, and why
     is_interrupted: bool  # by Ctrl-C
     margin: np.ndarray  # gain margins of the designs kept, NaN: not judged, (k,)
+    uncontrolled: float | None  # the metric without control; None: not known
 
 
 def run_screen(
@@ -171,9 +172,9 @@ def run_screen(
         is_interrupted = stop.is_set() and not is_done.all()
         if not is_interrupted and len(tally.row):
             write_best(out, screen, tally)
-    margin = np.full(len(tally.row), np.nan)
+    margin, without = np.full(len(tally.row), np.nan), None
     if not is_interrupted:
-        margin = kept_margins(screen, tally.row)
+        margin, without = kept_margins(screen, tally.row), uncontrolled(screen, tally.row)
     return ScreenOutcome(
         screen=screen,
         is_done=is_done,
@@ -181,4 +182,5 @@ def run_screen(
         lost=lost,
         is_interrupted=is_interrupted,
         margin=margin,
+        uncontrolled=without,
     )
