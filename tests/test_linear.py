@@ -11,6 +11,7 @@ from jaxmodel.linear import flatten, frequency_response, linearise, natural_mode
 from jaxmodel.loop import PlantState
 from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import prepare
+from jaxmodel.return_difference import assembled_modes, loop_response
 from jaxmodel.simulate import _about, simulate
 from studies.reference import tables
 from studies.study.cases import as_arrays, build_case, build_structure
@@ -40,6 +41,21 @@ def test_frequencies_equal_finite_elements(name):
     assert rigid.size == (0 if "springs" in name else 3)
     np.testing.assert_allclose(found, tables.frequencies(name), rtol=2e-4)
     assert not modes.damping_ratio.any()
+
+
+def test_assembled_modes_are_those_of_the_linear_plant():
+    """Of the machine whose drives and links have little damping, told to first order."""
+    study = paper_study().change(link__modes=3, drive__kd=1.0)
+    structure, case = build_structure(study), as_arrays(build_case(study))
+
+    @jax.jit
+    def assembled(case):
+        loop = prepare(structure, case).loop
+        return assembled_modes(loop_response(structure, case, loop, np.array(HOME)))
+
+    modes, found = natural_modes(linear(study)), assembled(case)
+    np.testing.assert_allclose(found.omega / (2 * np.pi), modes.frequency, rtol=1e-3)
+    np.testing.assert_allclose(found.decay / found.omega, modes.damping_ratio, rtol=0.02)
 
 
 def test_one_mode_is_enough_for_the_first_frequency():

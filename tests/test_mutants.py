@@ -147,7 +147,7 @@ def test_most_mutants_of_the_record_are_killed():
     assert set(count) == {"killed", "survived", "equivalent"}
     assert all(x.by for x in rows.values() if x.outcome != "survived")
     judged = len(rows) - count["equivalent"]
-    assert judged >= 150 and count["killed"] >= 0.86 * judged
+    assert len(rows) >= 300 and count["killed"] >= 0.9 * judged
     large = {file for file, text in SOURCES.items() if lines_of_code(text) >= 100}
     assert large <= {mutant.file for mutant in rows}
 
