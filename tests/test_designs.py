@@ -121,6 +121,17 @@ def test_quantiles_are_exact_within_one_per_cent():
         assert quantile(beyond.sketch[0], 0.5) == expected
 
 
+def test_texts_count_for_themselves():
+    """Those that none of the designs tried at first has, for nobody."""
+    kind = np.array(["zv", "ei", "ei", "none", "zvd", "zv"])
+    axes = divided({"kind": kind[:3]})
+    assert axes.labels[0].tolist() == ["ei", "zv"]
+    value, code = np.full(6, 1e-6), np.zeros(6, int)
+    tally = tally_of(np.arange(6), code, value, {"kind": kind}, axes, 10, False)
+    assert tally.sketch[axes.part(0)].sum(axis=1).tolist() == [2, 2]
+    assert tally.sketch[0].sum() == 6
+
+
 # --- designs --------------------------------------------------------------------------------------
 
 

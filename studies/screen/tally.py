@@ -60,10 +60,12 @@ class Axes(NamedTuple):
         return slice(first, first + len(self.bounds[axis]) + 1)
 
     def interval(self, axis: int, x: np.ndarray) -> np.ndarray:
-        """Which interval values are in, (n,)."""
+        """Which interval values are in, (n,); beyond the last one: texts that are no label."""
         labels = self.labels[axis]
-        numbers = np.searchsorted(labels, x) if len(labels) else x
-        return np.searchsorted(self.bounds[axis], numbers, side="right")
+        if not len(labels):
+            return np.searchsorted(self.bounds[axis], x, side="right")
+        place = np.minimum(np.searchsorted(labels, x), len(labels) - 1)
+        return np.where(labels[place] == x, place, len(labels))
 
 
 def divided(columns: Columns) -> Axes:
@@ -135,7 +137,7 @@ def tally_of(
     for axis, (name, bounds) in enumerate(zip(axes.names, axes.bounds, strict=True)):
         interval = axes.interval(axis, columns[name][is_fine])
         size = (len(bounds) + 1) * BUCKETS
-        counts = np.bincount(interval * BUCKETS + bucket, minlength=size)
+        counts = np.bincount(interval * BUCKETS + bucket, minlength=size)[:size]
         sketch[axes.part(axis)] = counts.reshape(-1, BUCKETS)
     order = _best(row, value, keep, is_largest)
     endings = np.bincount(code, minlength=N_ENDINGS)
