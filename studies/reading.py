@@ -209,16 +209,33 @@ def open_hdf5(path: Path) -> Iterator[h5py.File]:
 def _check_heaps(file: BufferedReader) -> None:
     """Raise ValueError for texts of an HDF5 file whose sizes make HDF5 walk them without end."""
     with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        first = content.find(_HEAP)
-        while first >= 0:
-            at, stop = first + 16, first + int.from_bytes(content[first + 8 : first + 16], "little")
-            while at + 16 <= min(stop, len(content)):
-                number, _, _, length = struct.unpack("<HHIQ", content[at : at + 16])
-                step = 16 + -(-length // 8) * 8 if number else length  # 0: the free rest
-                if not 0 < step <= stop - at:
-                    raise ValueError("its texts have sizes that do not fit")
-                at += step
-            first = content.find(_HEAP, first + 1)
+        for begin, end in _written(file.fileno()):
+            first = content.find(_HEAP, begin, end)
+            while first >= 0:
+                _check_heap(content, first)
+                first = content.find(_HEAP, first + 1, end)
+
+
+def _check_heap(content: mmap.mmap, first: int) -> None:
+    at, stop = first + 16, first + int.from_bytes(content[first + 8 : first + 16], "little")
+    while at + 16 <= min(stop, len(content)):
+        number, _, _, length = struct.unpack("<HHIQ", content[at : at + 16])
+        step = 16 + -(-length // 8) * 8 if number else length  # 0: the free rest
+        if not 0 < step <= stop - at:
+            raise ValueError("its texts have sizes that do not fit")
+        at += step
+
+
+def _written(file: int) -> Iterator[tuple[int, int]]:
+    """Where an open file has content: a sparse one may be a terabyte long, and hold nothing."""
+    end = 0
+    while True:
+        try:
+            begin = os.lseek(file, end, os.SEEK_DATA)
+        except OSError:  # none beyond
+            return
+        end = os.lseek(file, begin, os.SEEK_HOLE)
+        yield begin, end
 
 
 def _check_group(group: h5py.Group, most: int, seen: set[int], depth: int) -> None:
