@@ -229,7 +229,7 @@ def test_a_stage_is_not_done_twice(monkeypatch, tmp_path):
     assert made.is_good and "stage 1 of 4, fit: already computed" in text
     assert pretended.calls == ["fit", "tune", "certificate", "certificate", "firmware"]
     other = data(commission={"gain_margin": 3.0})
-    with pytest.raises(StudyError, match="another file, data or program"):
+    with pytest.raises(StudyError, match="begun with another file;"):
         run_commission(parse_measured(other), tmp_path / "out", True)
 
 
@@ -269,7 +269,7 @@ def test_other_data_are_another_commissioning(monkeypatch, tmp_path):
     measured = parse_measured(data(fit={"free": FREE, "data": [entry]}), tmp_path)
     run_commission(measured, tmp_path / "out", console=Console(quiet=True))
     file.write_text(file.read_text().replace("1.0", "1.1", 1))
-    with pytest.raises(StudyError, match="another file, data or program"):
+    with pytest.raises(StudyError, match="begun with another set of data"):
         run_commission(measured, tmp_path / "out", True)
 
 

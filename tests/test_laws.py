@@ -286,7 +286,7 @@ def test_a_comparison_writes_a_page_whose_order_is_that_of_the_runs(tmp_path, mo
     assert "(tuned to 0.001 V)" in text and "a disk margin below 1.99 on" in text
     html = findings._repr_html_()
     assert "strong + PD" in html and html.count("data:image/png;base64,") == 1
-    with pytest.raises(StudyError, match="another design, budget or program"):
+    with pytest.raises(StudyError, match="begun with another budget"):
         laws.run_laws(STUDY, tmp_path / "out", 40.0, 0.4, is_resumed=True, is_quiet=True)
 
 

@@ -84,7 +84,7 @@ def run_commission(
     with locked_folder(out, "commissioning"):
         refuse_existing(out, COMMISSIONINGS, is_resumed)
         request = make_manifest(measured.data, DECISIVE) | {"files": measured.data_files()}
-        checked = {"spec": "file", "code": "program", "files": "data"}
+        checked = {"spec": "file", "code": "program", "files": "set of data"}
         keep_request(out / COMMISSIONINGS.mark, request, checked)
         outcome = _outcome(measured, out, console)
         with publish(out) as staging:
