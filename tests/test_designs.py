@@ -425,7 +425,9 @@ def test_a_report_of_values_that_a_log_scale_lacks(whole, tmp_path):
         warnings.simplefilter("error")
         write_screen_report(tmp_path, done._replace(tally=tally))
     assert not list(tmp_path.glob("*.png"))
-    assert summary_lines(done._replace(tally=tally))[1].endswith("median of all: 0 µm or less")
+    assert summary_lines(done._replace(tally=tally))[1].endswith(
+        "median of those that are ok: 0 µm or less"
+    )
     largest = done._replace(screen=done.screen._replace(by=f"-{done.screen.by}"))
     assert [share for share, _ in quantile_rows(largest)] == ["1 %", "10 %", "50 %", "90 %"]
     least, most = quantile_rows(done), quantile_rows(largest)

@@ -24,6 +24,7 @@ from studies.screen.tally import LEFT_OUT, quantile
 from studies.show.figures import styled
 from studies.show.pages import page
 from studies.show.units import headed, readable
+from studies.space.table import CaseTable
 from studies.study.margin import ENOUGH, margin_text
 from studies.study.template import toml_text
 from studies.sweeps.plots import save_plot
@@ -53,7 +54,7 @@ def ending_rows(done: ScreenOutcome) -> list[tuple[str, str, str]]:
         if endings[code]:
             reason = "left out by where, or twice" if code == LEFT_OUT else status.REASONS[code]
             share = f"{100 * endings[code] / done.tally.n_designs:.3g} %"
-            rows.append((f"{endings[code]}", share, reason))
+            rows.append((f"{endings[code]:,}", share, reason))
     return rows
 
 
@@ -75,7 +76,7 @@ def summary_lines(done: ScreenOutcome) -> list[str]:
     """What the screen found, in a few lines."""
     tally, screen = done.tally, done.screen
     lines = [
-        f"{tally.n_designs} designs: "
+        f"{tally.n_designs:,} designs: "
         + "; ".join(f"{number} {reason}" for number, _, reason in ending_rows(done))
     ]
     n_without = int(tally.endings[status.OK] - tally.sketch[0].sum())
@@ -87,7 +88,8 @@ def summary_lines(done: ScreenOutcome) -> list[str]:
     half = quantity(done, quantile(tally.sketch[0], 0.5))
     half += " or less" if tally.value.min() < 0 else ""  # negative values count as 0
     lines.append(
-        f"the best {len(tally.row)} by {screen.entry}: {best} to {last}; median of all: {half}"
+        f"the best {len(tally.row)} by {screen.entry}: {best} to {last}; "
+        f"median of those that are ok: {half}"
     )
     lines += _uncontrolled_line(done)
     margin = done.margin[~np.isnan(done.margin)]
@@ -99,9 +101,11 @@ def summary_lines(done: ScreenOutcome) -> list[str]:
         f"{ENOUGH:g}"
     )
     if safe:
-        first = int(np.argmax(done.margin > ENOUGH))
+        place = _cases(done)[1]
+        case = int(np.argmax(done.margin[place] > ENOUGH))
+        first = place[case]
         value, text = quantity(done, tally.value[first]), margin_text(done.margin[first])
-        lines.append(f"the best of these: design {tally.row[first]} with {value}, margin {text}")
+        lines.append(f"the best of these: case {case} of {BEST} with {value}, margin {text}")
     return lines
 
 
@@ -165,11 +169,16 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
         (staging / REPORT).write_text(text, encoding="utf-8")
 
 
-def _best_rows(done: ScreenOutcome) -> list[tuple[str, ...]]:
-    """Of the best designs, those with margin enough; of all, if there are none."""
+def _cases(done: ScreenOutcome) -> tuple[CaseTable, np.ndarray]:
+    """Cases of `best.toml` that were judged, and their places among the designs kept."""
     judged = done.tally.row[:JUDGED]
     table = designs_table(done.screen, judged)
-    place = np.flatnonzero(np.isin(judged, table.row))  # of the cases of `best.toml`
+    return table, np.flatnonzero(np.isin(judged, table.row))
+
+
+def _best_rows(done: ScreenOutcome) -> list[tuple[str, ...]]:
+    """Of the best designs, those with margin enough; of all, if there are none."""
+    table, place = _cases(done)
     columns = axis_columns(table)
     factor = readable(unit_of(done))[0]
     robust = np.flatnonzero(done.margin[place] > ENOUGH)
