@@ -413,19 +413,23 @@ def test_spectra_of_the_measured_machine_stand_on_their_peaks():
     np.testing.assert_allclose(held, np.tile([92.5, 240.2], (3, 1)), rtol=1e-3)
 
 
+def moved(distance, duration, **changes):
+    """Study of a move along y [m] in some time [s], unshaped, with no delay of the window."""
+    return paper_study().change(
+        motion__waypoints=(HOME, (0.0, distance, HOME[2])),
+        motion__move_time=duration,
+        shaper__kind="none",
+        metrics__residual_delay=0.0,
+        run__smooth=True,
+        **changes,
+    )
+
+
 @pytest.mark.long  # in short: few steps are as good as forty, in test_integrator
 def test_one_step_per_sample_is_enough_for_the_fastest_moves():
     """20 mm in 0.03 s, actuators at their limit, 8 modes: a step against eight."""
-    study = paper_study().change(
-        motion__waypoints=(HOME, (0.0, 0.02, HOME[2])),
-        motion__move_time=0.03,
-        shaper__kind="none",
-        run__duration=0.08,
-        metrics__residual_delay=0.0,
-        metrics__residual_length=0.02,
-        control__gain_factor=1.0,
-        run__smooth=True,
-    )
+    rest = {"run__duration": 0.08, "metrics__residual_length": 0.02}
+    study = moved(0.02, 0.03, control__gain_factor=1.0, **rest)
     one, eight = (_simulate(*arrays(study.change(run__substeps=n)), True) for n in (1, 8))
     assert eight.metrics.peak_voltage.max() > 90
     signals = (np.asarray(x.record.chord_deflection_stations) for x in (one, eight))
@@ -435,15 +439,7 @@ def test_one_step_per_sample_is_enough_for_the_fastest_moves():
 
 def test_records_are_of_the_sampling_instant():
     """However many steps lead to the next one."""
-    study = paper_study().change(
-        motion__waypoints=(HOME, (0.0, 0.01, HOME[2])),
-        motion__move_time=0.02,
-        shaper__kind="none",
-        run__duration=0.04,
-        metrics__residual_delay=0.0,
-        metrics__residual_length=0.01,
-        run__smooth=True,
-    )
+    study = moved(0.01, 0.02, run__duration=0.04, metrics__residual_length=0.01)
     one, four = (
         np.asarray(_simulate(*arrays(study.change(run__substeps=n)), True).record.slider)
         for n in (1, 4)

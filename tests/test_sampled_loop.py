@@ -239,22 +239,33 @@ def test_ideal_feedback_damps_up_to_a_limit():
     np.testing.assert_allclose(ideal_damping(10.0)[0].min(), 0.046, atol=1e-3)
 
 
-def test_ideal_feedback_of_a_run_is_its_gains_times_rates():
-    """Rates by splines through deflections sampled ten times in a period of the fastest mode."""
-    study = paper_study().change(
-        link__modes=2,
-        control__feedback="ideal",
-        control__modes=2,
-        control__velocity_gain=(1.0, 0.5, 0.7),
-        initial__modal=((1e-4, 2e-5), (), (-1e-4, 0.0)),
+def at_home(**changes):
+    """(Structure, Case) of a short run that stays where it is."""
+    study = STUDY.change(
         motion__waypoints=(HOME, HOME),
         motion__move_time=0.01,
         run__duration=0.03,
         metrics__residual_delay=0.0,
         metrics__residual_length=0.01,
+        **changes,
     )
-    structure, case = build_structure(study), as_arrays(build_case(study))
-    record = jax.jit(simulate, static_argnums=(0, 2))(structure, case, True).record
+    return build_structure(study), as_arrays(build_case(study))
+
+
+def recorded(structure, case):
+    return jax.jit(simulate, static_argnums=(0, 2))(structure, case, True).record
+
+
+def test_ideal_feedback_of_a_run_is_its_gains_times_rates():
+    """Rates by splines through deflections sampled ten times in a period of the fastest mode."""
+    structure, case = at_home(
+        link__modes=2,
+        control__feedback="ideal",
+        control__modes=2,
+        control__velocity_gain=(1.0, 0.5, 0.7),
+        initial__modal=((1e-4, 2e-5), (), (-1e-4, 0.0)),
+    )
+    record = recorded(structure, case)
     on_rate = np.asarray(prepared(structure, case).loop.ideal[0])
     path = scipy.interpolate.CubicSpline(record.time, record.modal_coordinate)
     wanted = np.einsum("ikr,nir->nik", on_rate, path(record.time, 1))
@@ -267,20 +278,13 @@ def test_ideal_feedback_of_a_run_is_its_gains_times_rates():
 
 def test_what_rests_stays_at_rest():
     """With every state of the electronics."""
-    study = STUDY.change(
-        motion__waypoints=(HOME, HOME),
-        motion__move_time=0.01,
+    structure, case = at_home(
         electronics__amplifier_hz=2e3,
         electronics__sensor_highpass_hz=5.0,
         electronics__delay=1.5,
-        run__duration=0.03,
         run__smooth=True,
-        metrics__residual_delay=0.0,
-        metrics__residual_length=0.01,
     )
-    structure, case = build_structure(study), as_arrays(build_case(study))
-    structure = structure._replace(has_noise=False)
-    record = jax.jit(simulate, static_argnums=(0, 2))(structure, case, True).record
+    record = recorded(structure._replace(has_noise=False), case)
     for name in ("sensor_voltage", "actuator_voltage", "modal_coordinate", "pose_error"):
         np.testing.assert_allclose(getattr(record, name), 0.0, rtol=0, atol=1e-12, err_msg=name)
 
