@@ -222,8 +222,8 @@ class Stopped(LocalScreener):
     def __init__(self, count):
         self._count = count
 
-    def tallies(self, screen, shards, progress, stop):
-        for k, answer in enumerate(super().tallies(screen, shards, progress, stop)):
+    def tallies(self, work):
+        for k, answer in enumerate(super().tallies(work)):
             if k == self._count:
                 raise StudyError("killed")
             yield answer
@@ -249,8 +249,8 @@ def test_an_interrupted_screen_goes_on(whole, tmp_path):
 class Lossy(LocalScreener):
     """Gives a shard up."""
 
-    def tallies(self, screen, shards, progress, stop):
-        for shard, tally in super().tallies(screen, shards, progress, stop):
+    def tallies(self, work):
+        for shard, tally in super().tallies(work):
             yield shard, "its workers died" if shard == 2 else tally
 
 
@@ -266,10 +266,10 @@ def test_ctrl_c_keeps_what_is_finished(whole, tmp_path, monkeypatch):
     out, stop = tmp_path / "out", threading.Event()
 
     class Pressed(LocalScreener):
-        def tallies(self, screen, shards, progress, stop):
-            for answer in super().tallies(screen, shards, progress, stop):
+        def tallies(self, work):
+            for answer in super().tallies(work):
                 yield answer
-                stop.set()
+                work.stop.set()
 
     done = screened(out, screener=Pressed())
     assert done.is_interrupted and done.is_done.sum() == 1

@@ -32,9 +32,9 @@ class Watched(LocalScreener):
     def __init__(self):
         self.notes = []
 
-    def tallies(self, screen, shards, progress, stop):
+    def tallies(self, work):
         own = psutil.Process()
-        for answer in super().tallies(screen, shards, progress, stop):
+        for answer in super().tallies(work):
             note = own.memory_info().rss, own.num_fds(), own.num_threads()
             self.notes.append(note)
             yield answer

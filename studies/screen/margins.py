@@ -11,24 +11,21 @@ from studies.engine.results import SweepData, controlled, uncontrolled_value
 from studies.engine.run_data import metric_variables
 from studies.engine.runs import run_uncontrolled
 from studies.errors import StudyError
-from studies.screen.shards import ScreenRequest, designs_table
+from studies.screen.shards import ScreenRequest
+from studies.space.table import CaseTable
 
 #: Designs that are judged, best first.
 JUDGED = 10_000
 
 
-def kept_margins(screen: ScreenRequest, row: np.ndarray) -> np.ndarray:
-    """Gain margins of designs, (n,): factors on all gains [1].
+def kept_margins(screen: ScreenRequest, kept: CaseTable) -> np.ndarray:
+    """Gain margins of the designs kept, (n,): factors on all gains [1]; NaN after `JUDGED`.
 
     Args:
         screen: of the designs.
-        row: their numbers, best first, (n,); NaN for those after `JUDGED`.
+        kept: these, best first.
     """
-    judged = row[:JUDGED]
-    found = np.full(len(row), np.nan)
-    if not len(row):
-        return found
-    table = designs_table(screen, judged)
+    table = kept.rows(np.arange(min(JUDGED, len(kept))))
     margin = np.full(len(table), np.nan)
     groups = plan_groups(
         table, np.arange(len(table)), local_layout, (screen.metric,), is_linear=True
@@ -38,24 +35,20 @@ def kept_margins(screen: ScreenRequest, row: np.ndarray) -> np.ndarray:
             cases = chunk_cases(table, chunk.rows, group.structure, group.layout.size)
             figures = judge_cases(group.structure, cases)
             margin[chunk.rows] = np.asarray(figures.gain_margin)[: len(chunk.rows)]
-    found[: len(judged)][np.isin(judged, table.row)] = margin
-    return found
+    return np.pad(margin, (0, len(kept) - len(table)), constant_values=np.nan)
 
 
-def uncontrolled(screen: ScreenRequest, row: np.ndarray) -> float | None:
+def uncontrolled(screen: ScreenRequest, kept: CaseTable) -> float | None:
     """What the designs are ranked by, of the study's machine without control.
 
     Args:
         screen: of the designs.
-        row: their numbers, best first, (n,).
+        kept: these, best first.
 
     Returns:
         Value [unit of the metric]; None where there is nothing to compare, or no such run.
     """
-    if not len(row):
-        return None
-    table = designs_table(screen, row[:JUDGED])
-    if not controlled(table).any():
+    if not controlled(kept).any():
         return None
     try:
         run = run_uncontrolled(screen.spec.study, is_linear=screen.spec.sweep.fidelity == "linear")
@@ -63,5 +56,5 @@ def uncontrolled(screen: ScreenRequest, row: np.ndarray) -> float | None:
         return None
     if run.status not in status.FINISHED:
         return None
-    data = SweepData({}, {}, screen.spec, table, metric_variables(run.result))
+    data = SweepData({}, {}, screen.spec, kept, metric_variables(run.result))
     return uncontrolled_value(data, screen.entry)

@@ -15,16 +15,14 @@ from jaxmodel.metrics import METRICS
 from studies.engine.results import ROUNDING
 from studies.extensions import options
 from studies.publish import REPORT, publish
-from studies.screen.margins import JUDGED
 from studies.screen.plots import influence, values
 from studies.screen.run import ScreenOutcome
-from studies.screen.shards import axis_columns, designs_table
+from studies.screen.shards import axis_columns
 from studies.screen.stored import BEST
 from studies.screen.tally import LEFT_OUT, quantile
 from studies.show.figures import styled
 from studies.show.pages import page
 from studies.show.units import headed, readable
-from studies.space.table import CaseTable
 from studies.study.margin import ENOUGH, margin_text
 from studies.study.template import toml_text
 from studies.sweeps.plots import save_plot
@@ -101,9 +99,8 @@ def summary_lines(done: ScreenOutcome) -> list[str]:
         f"{ENOUGH:g}"
     )
     if safe:
-        place = _cases(done)[1]
-        case = int(np.argmax(done.margin[place] > ENOUGH))
-        first = place[case]
+        case = int(np.argmax(done.margin[done.place] > ENOUGH))
+        first = done.place[case]
         value, text = quantity(done, tally.value[first]), margin_text(done.margin[first])
         lines.append(f"the best of these: case {case} of {BEST} with {value}, margin {text}")
     return lines
@@ -169,29 +166,23 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
         (staging / REPORT).write_text(text, encoding="utf-8")
 
 
-def _cases(done: ScreenOutcome) -> tuple[CaseTable, np.ndarray]:
-    """Cases of `best.toml` that were judged, and their places among the designs kept."""
-    judged = done.tally.row[:JUDGED]
-    table = designs_table(done.screen, judged)
-    return table, np.flatnonzero(np.isin(judged, table.row))
-
-
 def _best_rows(done: ScreenOutcome) -> list[tuple[str, ...]]:
     """Of the best designs, those with margin enough; of all, if there are none."""
-    table, place = _cases(done)
-    columns = axis_columns(table)
-    factor = readable(unit_of(done))[0]
+    assert done.kept is not None
+    factor, place = readable(unit_of(done))[0], done.place
     robust = np.flatnonzero(done.margin[place] > ENOUGH)
-    cases = robust if len(robust) else np.arange(len(table))
+    cases = (robust if len(robust) else np.arange(len(place)))[:SHOWN]
+    table = done.kept.rows(cases)
+    columns = axis_columns(table)
     return [
         (
             str(case),
-            str(table.row[case]),
+            str(table.row[k]),
             f"{factor * done.tally.value[place[case]]:.4g}",
             margin_text(done.margin[place[case]]),
-            *(_shown(columns[name][case]) for name in done.screen.axes.names),
+            *(_shown(columns[name][k]) for name in done.screen.axes.names),
         )
-        for case in cases[:SHOWN]
+        for k, case in enumerate(cases)
     ]
 
 

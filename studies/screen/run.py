@@ -18,7 +18,7 @@ from studies.engine.folder import locked_folder
 from studies.engine.progress import Phases, duration_text
 from studies.engine.sweep import interrupts
 from studies.screen.margins import kept_margins, uncontrolled
-from studies.screen.shards import ScreenRequest, shard_tally
+from studies.screen.shards import ScreenRequest, designs_table, shard_tally
 from studies.screen.stored import begin, write_best, write_tally
 from studies.screen.tally import LEFT_OUT, Tally, merged
 from studies.show.units import count_text
@@ -56,46 +56,36 @@ class ScreenProgress:
         self._phases.advance(self._done, self._total, text, left and f"about {left}")
 
 
+class ShardWork(NamedTuple):
+    """Shards to run."""
+
+    screen: ScreenRequest
+    shards: Iterable[int]  # their numbers
+    progress: ScreenProgress  # told of designs that have run
+    stop: threading.Event  # once set, no further shards are begun
+
+
 class Screener(Protocol):
     """Where shards are run."""
 
-    def tallies(
-        self,
-        screen: ScreenRequest,
-        shards: Iterable[int],
-        progress: ScreenProgress,
-        stop: threading.Event,
-    ) -> Iterator[tuple[int, Tally | str]]:
-        """Run shards.
-
-        Args:
-            screen: of the shards.
-            shards: their numbers.
-            progress: told of designs that have run.
-            stop: once set, no further shards are begun.
-
-        Returns:
-            each shard with its tally, or with the reason why it was given up.
-        """
+    def tallies(self, work: ShardWork) -> Iterator[tuple[int, Tally | str]]:
+        """Each shard with its tally, or with the reason why it was given up."""
         ...
 
 
 class LocalScreener:
     """Runs shards in this process, and makes the designs of the next one meanwhile."""
 
-    def tallies(
-        self,
-        screen: ScreenRequest,
-        shards: Iterable[int],
-        progress: ScreenProgress,
-        stop: threading.Event,
-    ) -> Iterator[tuple[int, Tally | str]]:
+    def tallies(self, work: ShardWork) -> Iterator[tuple[int, Tally | str]]:
+        """As the protocol says."""
+        screen = work.screen
+
         def make(shard: int) -> tuple[int, CaseTable]:
             return shard, build_table(screen.spec, screen.rows(shard))
 
         with ThreadPoolExecutor(1) as pool:
-            for shard, table in _one_ahead(pool, make, shards):
-                tally = shard_tally(screen, shard, table, stop, progress.add)
+            for shard, table in _one_ahead(pool, make, work.shards):
+                tally = shard_tally(screen, shard, table, work.stop, work.progress.add)
                 if tally is None:
                     return
                 yield shard, tally
@@ -122,8 +112,15 @@ class ScreenOutcome(NamedTuple):
     tally: Tally
     lost: dict[int, str]  # shards that were given up, and why
     is_interrupted: bool  # by Ctrl-C
+    kept: CaseTable | None  # cases of `best.toml`, best first; None: interrupted, or none
     margin: np.ndarray  # gain margins of the designs kept, NaN: not judged, (k,)
     uncontrolled: float | None  # the metric without control; None: not known
+
+    @property
+    def place(self) -> np.ndarray:
+        """Which of the designs kept each case of `best.toml` is, (n,)."""
+        assert self.kept is not None
+        return np.flatnonzero(np.isin(self.tally.row, self.kept.row))
 
 
 def run_screen(
@@ -161,7 +158,7 @@ def run_screen(
             "screen", f"{screen.n_designs:,} designs in {count_text(screen.n_shards, 'shard')}"
         )
         progress = ScreenProgress(phases, screen.n_designs, tally.n_designs)
-        for shard, answer in screener.tallies(screen, left, progress, stop):
+        for shard, answer in screener.tallies(ShardWork(screen, left, progress, stop)):
             if isinstance(answer, str):
                 lost[shard] = answer
                 phases.say(f"shard {shard} is left out: {answer}")
@@ -170,17 +167,20 @@ def run_screen(
             is_done[shard] = True
             write_tally(out, screen, is_done, tally)
         is_interrupted = stop.is_set() and not is_done.all()
-        if not is_interrupted and len(tally.row):
-            write_best(out, screen, tally)
+        kept = None if is_interrupted or not len(tally.row) else designs_table(screen, tally.row)
+        if kept is not None:
+            write_best(out, screen, kept)
     margin, without = np.full(len(tally.row), np.nan), None
-    if not is_interrupted:
-        margin, without = kept_margins(screen, tally.row), uncontrolled(screen, tally.row)
+    if kept is not None:
+        margin[np.isin(tally.row, kept.row)] = kept_margins(screen, kept)
+        without = uncontrolled(screen, kept)
     return ScreenOutcome(
         screen=screen,
         is_done=is_done,
         tally=tally,
         lost=lost,
         is_interrupted=is_interrupted,
+        kept=kept,
         margin=margin,
         uncontrolled=without,
     )

@@ -11,10 +11,10 @@ import numpy as np
 from studies.engine.folder import keep_request, make_manifest
 from studies.errors import StudyError
 from studies.publish import replacing
-from studies.screen.shards import ScreenRequest, designs_table
+from studies.screen.shards import ScreenRequest
 from studies.screen.tally import BUCKETS, GROWTH, LEAST, N_ENDINGS, Tally, nothing
 from studies.space.axes import LABELS
-from studies.space.table import as_python
+from studies.space.table import CaseTable, as_python
 from studies.store import Variable, numbers_digest, read_store, write_store
 from studies.study.template import toml_text, toml_value
 
@@ -143,23 +143,22 @@ def _interval_names(screen: ScreenRequest) -> list[str]:
     ]
 
 
-def best_sweep(screen: ScreenRequest, tally: Tally) -> str:
+def best_sweep(screen: ScreenRequest, kept: CaseTable) -> str:
     """The kept designs as the file of a sweep, best first, whose cases have the same ids."""
     data = screen.spec.data
     written = {name: x for name, x in data["sweep"].items() if name not in _SPREADING}
     sweep: dict[str, Any] = written | {"method": "list", "by": screen.by}
     sweep.pop("fidelity", None)
     sections = {name: x for name, x in data.items() if name != "sweep"}
-    table = designs_table(screen, tally.row)
-    fields = {name: x for name, x in table.fields.items() if name not in LABELS}
+    fields = {name: x for name, x in kept.fields.items() if name not in LABELS}
     cases = [
-        {name: as_python(column[k]) for name, column in fields.items()} for k in range(len(table))
+        {name: as_python(column[k]) for name, column in fields.items()} for k in range(len(kept))
     ]
     lines = "".join(f"  {toml_value(case)},\n" for case in cases)
     return f"{toml_text({**sections, 'sweep': sweep})}cases = [\n{lines}]\n"
 
 
-def write_best(folder: Path, screen: ScreenRequest, tally: Tally) -> None:
+def write_best(folder: Path, screen: ScreenRequest, kept: CaseTable) -> None:
     """Write `best.toml`, whole or not at all."""
     with replacing(folder / BEST) as temporary:
-        temporary.write_text(best_sweep(screen, tally), encoding="utf-8")
+        temporary.write_text(best_sweep(screen, kept), encoding="utf-8")

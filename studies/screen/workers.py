@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
@@ -13,7 +13,7 @@ from studies import config
 from studies.cluster.runner import answers
 from studies.cluster.watch import Watch, wait_for_workers
 from studies.cluster.worker import identity, working
-from studies.screen.run import ScreenProgress
+from studies.screen.run import ShardWork
 from studies.screen.shards import ScreenRequest, screen_of, shard_tally
 from studies.screen.tally import Tally
 from studies.space.spec import parse_sweep
@@ -54,13 +54,9 @@ class ClusterScreener:
         """
         self._client, self._timeout = client, timeout
 
-    def tallies(
-        self,
-        screen: ScreenRequest,
-        shards: Iterable[int],
-        progress: ScreenProgress,
-        stop: threading.Event,
-    ) -> Iterator[tuple[int, Tally | str]]:
+    def tallies(self, work: ShardWork) -> Iterator[tuple[int, Tally | str]]:
+        """As the protocol says."""
+        screen, progress = work.screen, work.progress
         wait_for_workers(self._client)
         watch = Watch(self._client, self._timeout, progress.say)
         progress.say(f"workers: {watch.n_workers}; each compiles before its first shard")
@@ -79,7 +75,7 @@ class ClusterScreener:
             )
             return self._client.submit(run_shard, job, pure=False)
 
-        with closing(answers(self._client, watch, shards, submit, stop)) as answered:
+        with closing(answers(self._client, watch, work.shards, submit, work.stop)) as answered:
             for shard, answer in answered:
                 if isinstance(answer, ShardDone):
                     progress.add(answer.tally.endings)
