@@ -42,7 +42,7 @@ from studies.engine import plan
 plan.LANES, plan.LARGEST_CHUNK = 8, 16
 if sys.argv[1] == "screen":
     from studies.screen import shards
-    shards.SHARD, shards.LANES = 64, 8
+    shards.SHARD, shards.LANES = (64, 64), 8
 place, step = os.environ["KILL_PLACE"], int(os.environ["KILL_STEP"])
 changes, count = {"os.rename", "os.remove", "os.rmdir", "os.mkdir"}, [0]
 

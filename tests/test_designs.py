@@ -16,9 +16,9 @@ from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import run_uncontrolled
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
-from studies.screen.report import quantile_rows, summary_lines, write_screen_report
+from studies.screen.report import margin_rows, quantile_rows, summary_lines, write_screen_report
 from studies.screen.run import LocalScreener, run_screen
-from studies.screen.shards import screen_of
+from studies.screen.shards import axis_columns, screen_of
 from studies.screen.stored import BEST, TALLY, read_tally, write_tally
 from studies.screen.tally import (
     LEFT_OUT,
@@ -48,8 +48,8 @@ SPEC = small_spec(SWEEP)
 KEEP = 12
 
 
-def screened(out, spec=SPEC, screener=None, shard_size=64, keep=KEEP, **more):
-    screen = screen_of(spec, keep=keep, shard_size=shard_size, **more)
+def screened(out, spec=SPEC, screener=None, shard_size=64, keep=KEEP, margin=0.0, **more):
+    screen = screen_of(spec, keep=keep, margin=margin, shard_size=shard_size, **more)
     return run_screen(screen, out, is_quiet=True, screener=screener)
 
 
@@ -184,6 +184,7 @@ def test_a_screen_has_the_values_of_a_sweep_by_the_linear_model(tmp_path):
     # the sweep judges stability as well, which a screen does not: unstable ones are kept here
     stable = set(data.table.row[data["status"] == status.OK].tolist())
     kept = done.tally.row.tolist()
+    assert done.n_kept == len(kept)
     assert stable <= set(kept) and len(stable) > 100
     np.testing.assert_allclose(done.tally.value, [value[row] for row in kept], rtol=1e-9)
     assert np.all(np.diff(done.tally.value) >= 0)
@@ -198,9 +199,10 @@ def test_a_screen_has_the_values_of_a_sweep_by_the_linear_model(tmp_path):
 def test_kept_designs_are_a_sweep_with_the_same_ids(whole):
     out, done = whole
     spec = load_sweep(out / BEST)
-    expected = build_table(SPEC, np.sort(done.tally.row))
+    rows = done.tally.row[:KEEP]
+    expected = build_table(SPEC, np.sort(rows))
     place = {int(row): k for k, row in enumerate(expected.row)}
-    order = [place[row] for row in done.tally.row.tolist()]
+    order = [place[row] for row in rows.tolist()]
     table = build_table(spec)
     np.testing.assert_array_equal(table.case_id, expected.case_id[order])
     np.testing.assert_array_equal(table.seed, expected.seed[order])
@@ -211,9 +213,53 @@ def test_kept_designs_have_the_margins_of_the_sweep(whole, tmp_path):
     _, done = whole
     run_sweep(load_sweep(whole[0] / BEST), tmp_path / "sweep", is_quiet=True)
     data = read_sweep(tmp_path / "sweep")
-    np.testing.assert_allclose(done.margin, data["gain_margin"], rtol=1e-9)
-    lines = summary_lines(done)
-    assert f"of the best {KEEP}, {np.sum(done.margin < 1)} are unstable" in lines[3]
+    margin = done.selection.margin
+    np.testing.assert_allclose(margin, data["gain_margin"], rtol=1e-9)
+    assert f"of the best {KEEP} judged, {np.sum(margin < 1)} are unstable" in summary_lines(done)
+
+
+def test_designs_with_the_margin_asked_for_are_kept(whole, tmp_path):
+    """The best of all that have it, as a sweep of all designs finds them; nothing runs again."""
+    _, done = whole
+    run_sweep(small_spec(SWEEP | {"fidelity": "linear"}), tmp_path / "sweep", is_quiet=True)
+    data = read_sweep(tmp_path / "sweep")
+    out, value = tmp_path / "out", metric_values(data, SWEEP["by"])
+    screened(out)  # whatever the margins
+    for margin in (1.0, 2.5, 4.0):
+        is_wanted = (data["gain_margin"] >= margin) & (data["status"] == status.OK)
+        order = np.flatnonzero(is_wanted)[np.argsort(value[is_wanted])][:KEEP]
+        found = screened(out, screener=Stopped(0), margin=margin)
+        assert found.selection.kept.row.tolist() == data.table.row[order].tolist()
+        written = build_table(load_sweep(out / BEST)).case_id
+        assert written.tolist() == data.table.case_id[order].tolist()
+        assert f"with a gain margin of at least {margin:g}" in summary_lines(found)[1]
+        assert_same(found.tally, done.tally)
+    assert len(order) == KEEP  # enough have even the largest one
+
+
+def test_nothing_is_kept_where_no_design_has_the_margin(tmp_path):
+    screened(tmp_path)
+    assert (tmp_path / BEST).exists()
+    none = screened(tmp_path, margin=60.0)
+    assert none.n_kept == 0 and not (tmp_path / BEST).exists()
+    assert "none has a gain margin of at least 60 (largest: " in summary_lines(none)[-2]
+    write_screen_report(tmp_path, none)
+    text = text_of((tmp_path / "report.html").read_text())
+    assert "None of these is kept: they lack the margin." in text and "Next steps" not in text
+
+
+def test_the_same_links_count_for_all_designs(tmp_path):
+    """Designs that control other links are in other shards, and yet compare."""
+    gain = {"from": 0.1, "to": 1.0, "count": 8}
+    links = [[True, False, False], [False, True, False], [True, True, False]]
+    sweep = {"method": "grid", "axes": {"control.links": links, "gain": gain}, "by": "residual_rms"}
+    done = screened(tmp_path / "out", small_spec(sweep), shard_size=8)
+    assert done.screen.links.tolist() == [True, True, False]
+    run_sweep(small_spec(sweep | {"fidelity": "linear"}), tmp_path / "sweep", is_quiet=True)
+    data = read_sweep(tmp_path / "sweep")
+    value = dict(zip(data.table.row.tolist(), metric_values(data, "residual_rms"), strict=True))
+    expected = [value[row] for row in done.tally.row.tolist()]
+    np.testing.assert_allclose(done.tally.value, expected, rtol=1e-9)
 
 
 class Stopped(LocalScreener):
@@ -242,8 +288,11 @@ def test_an_interrupted_screen_goes_on(whole, tmp_path):
     assert sorted(path.name for path in out.iterdir()) == sorted(
         [".lock", BEST, TALLY, "screen.json"]
     )
-    with pytest.raises(StudyError, match=r"was begun with another --keep \(12, now 13\)"):
-        screened(out, keep=KEEP + 1)
+    more = screened(out, keep=KEEP + 1)  # chosen among the candidates: nothing runs again
+    assert more.selection.kept.row.tolist() == done.tally.row[: KEEP + 1].tolist()
+    by = "structural_rms[link=1][station=2]"
+    with pytest.raises(StudyError, match="was begun with another --by"):
+        screened(out, by=by)
 
 
 class Lossy(LocalScreener):
@@ -296,11 +345,10 @@ def test_damaged_tallies_are_refused(whole, tmp_path):
     (tmp_path / TALLY).write_bytes((out / TALLY).read_bytes()[:3000])
     with pytest.raises(StudyError, match=r"remove it and begin again"):
         read_tally(tmp_path, done.screen)
-    for more in ({"keep": KEEP - 1}, {"by": "structural_rms[link=1][station=2]"}):
-        other = done.screen._replace(**more)  # a file of the same shape, from elsewhere
-        write_tally(tmp_path, other, done.is_done, done.tally)
-        with pytest.raises(StudyError, match="not what was written for this screen"):
-            read_tally(tmp_path, done.screen)
+    other = done.screen._replace(by="structural_rms[link=1][station=2]")
+    write_tally(tmp_path, other, done.is_done, done.tally)  # of the same shape, from elsewhere
+    with pytest.raises(StudyError, match="not what was written for this screen"):
+        read_tally(tmp_path, done.screen)
     write_tally(tmp_path, done.screen, done.is_done, done.tally)
     assert_same(read_tally(tmp_path, done.screen)[1], done.tally)
 
@@ -309,7 +357,7 @@ def test_full_model_of_the_same_designs(whole, tmp_path):
     """The true best ones, without a table of all cases."""
     full = screened(tmp_path / "full", fidelity="full")
     assert full.tally.n_designs == 200
-    common = np.intersect1d(full.tally.row, whole[1].tally.row)
+    common = np.intersect1d(full.tally.row[:KEEP], whole[1].tally.row[:KEEP])
     assert len(common) >= 0.8 * KEEP
     assert not np.array_equal(full.tally.value, whole[1].tally.value)
 
@@ -328,10 +376,23 @@ def test_what_a_screen_cannot_do_is_refused():
         screen_of(SPEC, by="structral_rms")
     with pytest.raises(StudyError, match="allowed"):
         screen_of(SPEC, by="structural_rms[link=4]")
-    with pytest.raises(StudyError, match="--keep = 0"):
-        screen_of(SPEC, keep=0)
+    for more, message in (
+        ({"keep": 0}, "--keep = 0"),
+        ({"keep": 100_001}, "--keep = 100001; allowed: 1 to 100000"),
+        ({"margin": -1.0}, "--margin = -1.0; allowed: 0 to less than 64"),
+        ({"margin": 64.0}, "--margin = 64.0"),
+        ({"margin": float("nan")}, "--margin = nan"),
+    ):
+        with pytest.raises(StudyError, match=message):
+            screen_of(SPEC, **more)
     with jax.enable_x64(False), pytest.raises(StudyError, match="--by = 'residual_rms'.*float32"):
         screen_of(SPEC, by="residual_rms")
+
+
+def test_sizes_of_shards():
+    """An interruption loses little of a screen of any size."""
+    for count, size in ((100, 2**14), (10**6, 2**14), (3 * 10**6, 2**16), (10**9, 2**18)):
+        assert screen_of(small_spec(SWEEP | {"count": count})).shard_size == size
 
 
 def test_slow_axes_of_a_grid_are_seen():
@@ -388,16 +449,39 @@ def test_report_of_axes_of_text(tmp_path):
     assert (tmp_path / "influence.png").exists()
 
 
-def test_designs_without_margin_are_not_shown_as_the_best(tmp_path):
-    """The table holds those with a margin above 2, under their numbers in best.toml."""
-    done = screened(tmp_path, SPEC)
-    margin = np.full(len(done.margin), 0.5)
-    margin[3] = 2.5
-    write_screen_report(tmp_path, done._replace(margin=margin))
+def test_the_report_tells_what_margin_costs(whole, tmp_path):
+    """The table holds what is kept, under the numbers in best.toml."""
+    done = screened(tmp_path, SPEC, margin=2.5)
+    selection = done.selection
+    write_screen_report(tmp_path, done)
     text = text_of((tmp_path / "report.html").read_text())
-    assert "Those with a gain margin above 2." in text
-    assert len(re.findall(r"^\| *\d+ \|.*\| 0\.5 \|", text, re.MULTILINE)) == 0
-    assert re.search(rf"^\| *3 \| {done.tally.row[3]} \|.*\| 2\.5 \|", text, re.MULTILINE)
+    assert f"a sweep of all {KEEP} designs that were kept" in text
+    for case, row in enumerate(selection.kept.row[:3]):
+        assert re.search(rf"^\| *{case} \| *{row} \|", text, re.MULTILINE)
+    costs = margin_rows(done)
+    assert [f"| {' | '.join(row)} |" in re.sub(" +", " ", text) for row in costs]
+    best = [float(value.split()[0]) for _, _, value in costs]
+    assert best == sorted(best) and costs[0][0] == "0" and len(costs) >= 5
+    count = {least: int(number) for least, number, _ in costs}
+    assert count["3"] == np.sum(selection.margin >= 3)
+    assert "gain_margin >= 2.5" in html.unescape(text)
+
+
+def test_ends_of_axes_are_pointed_out(tmp_path):
+    done = screened(tmp_path, keep=200)
+    selection, axes, name = done.selection, done.screen.axes, "control.gain_factor"
+    gain = axis_columns(selection.table)[name]
+    order, interval = np.argsort(gain), axes.interval(axes.names.index(name), gain)
+
+    def told(chosen):
+        is_kept = np.isin(np.arange(len(gain)), chosen)
+        lines = summary_lines(done._replace(selection=selection._replace(is_kept=is_kept)))
+        return [line for line in lines if "widen" in line]
+
+    assert not told(order)
+    (lower,) = told(np.flatnonzero(interval == 0))
+    assert f"the lower end of {name}" in lower and "upper" not in lower
+    assert not told(order[len(order) // 3 : len(order) // 2])
 
 
 def test_nothing_is_kept_where_no_design_ends_well(tmp_path, capsys):
@@ -428,7 +512,10 @@ def test_a_report_of_values_that_a_log_scale_lacks(whole, tmp_path):
     assert summary_lines(done._replace(tally=tally))[1].endswith(
         "median of those that are ok: 0 µm or less"
     )
-    largest = done._replace(screen=done.screen._replace(by=f"-{done.screen.by}"))
+    largest = done._replace(
+        screen=done.screen._replace(by=f"-{done.screen.by}"),
+        tally=done.tally._replace(value=done.tally.value[::-1]),
+    )
     assert [share for share, _ in quantile_rows(largest)] == ["1 %", "10 %", "50 %", "90 %"]
     least, most = quantile_rows(done), quantile_rows(largest)
     assert least[-1][1].replace("less", "more") == most[1][1]  # 90 % are below, 10 % above
@@ -452,10 +539,10 @@ def test_report_says_what_was_found(whole):
     assert lines[1].startswith(f"the best {KEEP} by structural_rms[link=2][station=2]")
     alone = run_uncontrolled(SPEC.study, is_linear=True).result.metrics.structural_rms[1, 1]
     assert done.uncontrolled == pytest.approx(float(alone), rel=1e-9)
-    assert lines[2].startswith("structural_rms[link=2][station=2] of the baseline without control:")
+    assert lines[-1].startswith("structural_rms[link=2][station=2] of the baseline without control")
     worse = done._replace(uncontrolled=0.9 * done.tally.value[0])
-    assert summary_lines(worse)[2].endswith("no design is below it")
-    assert "no design is below it" not in lines[2]
+    assert summary_lines(worse)[-1].endswith("no design is below it")
+    assert "no design is below it" not in lines[-1]
     assert {"values.png", "influence.png"} <= {path.name for path in out.iterdir()}
 
 
@@ -467,7 +554,7 @@ def test_the_command(tmp_path, capsys):
     main(["screen", str(file), "--out", str(out), "--keep", "5"])
     text = capsys.readouterr().out
     again = f"studies sweep {quote(str(out / BEST))} --out DIR"
-    assert "the best 5 by" in text and again in text
+    assert "the best 5 with a gain margin of at least 2 by" in text and again in text
     with pytest.raises(StudyError, match="holds a screen.*studies sweep '.*best.toml'"):
         read_sweep(out)
     assert again in html.unescape((out / "report.html").read_text())

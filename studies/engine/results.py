@@ -51,6 +51,7 @@ class SweepData:
     spec: SweepSpec
     cases: CaseTable | None = None  # where they are at hand, or not all of the sweep's
     baseline: dict[str, Variable] = field(default_factory=dict)  # without control; {}: not known
+    counted: np.ndarray | None = None  # links that metrics count; None: from its cases
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self.variables[name].data
@@ -333,6 +334,8 @@ def counted_links(data: SweepData) -> np.ndarray:
 
     The same for all cases; otherwise fewer controlled links would look like less vibration.
     """
+    if data.counted is not None:
+        return data.counted
     is_counted = np.any(controlled(data.table), axis=0)
     return is_counted if is_counted.any() else np.ones_like(is_counted)
 

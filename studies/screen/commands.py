@@ -14,6 +14,7 @@ from rich.console import Console
 from studies.cluster.connect import LocalWorkers, Scheduler, Workers, WorkerTimeout, on_workers
 from studies.config import start
 from studies.publish import REPORT, announce
+from studies.study.margin import ENOUGH
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -39,6 +40,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             str, typer.Option(help="metric; default: sweep.by. After - the largest come first")
         ] = "",
         keep: Annotated[int, typer.Option(help="number of designs to keep")] = 1000,
+        margin: Annotated[
+            float, typer.Option(help="least gain margin of the designs to keep; 0: any")
+        ] = ENOUGH,
         fidelity: Annotated[
             Fidelity, typer.Option(help="model of the runs; full takes about twice as long")
         ] = Fidelity.LINEAR,
@@ -68,7 +72,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.screen.stored import BEST
         from studies.space.spec import load_sweep
 
-        asked = screen_of(load_sweep(spec), by, keep, fidelity.value)
+        asked = screen_of(load_sweep(spec), by, keep, margin, fidelity.value)
 
         def make(client: Client) -> Screener:
             from studies.screen.workers import ClusterScreener
@@ -81,22 +85,25 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             if not done.is_interrupted:
                 phases.begin("report")
                 write_screen_report(out, done)
-        asks = f"--by={quote(asked.by)} --keep {keep} --fidelity {fidelity} --precision {precision}"
+        asks = (
+            f"--by={quote(asked.by)} --keep {keep} --margin {margin:g} --fidelity {fidelity} "
+            f"--precision {precision}"
+        )
         again = (
             f"studies {options()}screen {quote(str(spec))} --out {quote(str(out))} {asks} --resume"
             f"{workers.options}"
         )
         if done.is_interrupted:
             print(
-                f"studies: interrupted; {done.tally.n_designs} of {asked.n_designs} designs are "
-                f"safe; continue with: {again}",
+                f"studies: interrupted; {done.tally.n_designs:,} of {asked.n_designs:,} designs "
+                f"are safe; continue with: {again}",
                 file=sys.stderr,
             )
             sys.exit(130)
         if not quiet:
             for line in summary_lines(done):
                 console.print(line, soft_wrap=True)
-            if len(done.tally.row):
+            if done.n_kept:
                 console.print(
                     f"the full model of the best: studies {options()}sweep "
                     f"{quote(str(out / BEST))} --out DIR",

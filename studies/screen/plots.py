@@ -16,6 +16,8 @@ from studies.study.paths import field_unit
 ACROSS = 3
 #: Shares of the designs in an interval, counted from the best: the curves.
 CURVES = ((0.5, "median"), (0.1, "best 10 %"), (0.001, "best 0.1 %"))
+#: Values of an axis that are all marked.
+FEW = 6
 #: Ratio of the ends from which on an axis is drawn on a log scale.
 WIDE = 20
 
@@ -37,7 +39,7 @@ def values(done: ScreenOutcome) -> Figure:
         alpha=0.6,
     )
     for value, color, style in (
-        (done.tally.value[-1], figures.SERIES[1], "-"),
+        (_last_kept(done), figures.SERIES[1], "-"),
         (done.uncontrolled, figures.SERIES[4], "--"),
     ):
         if value is not None:
@@ -48,6 +50,17 @@ def values(done: ScreenOutcome) -> Figure:
     if counts[part].max() > 100:
         axes.set_yscale("log")
     return figure
+
+
+def _last_kept(done: ScreenOutcome) -> float | None:
+    selection = done.selection
+    return float(selection.value[selection.is_kept][-1]) if selection and done.n_kept else None
+
+
+def axis_head(name: str) -> str:
+    """An axis with its unit."""
+    unit = field_unit(name.partition("[")[0])
+    return name if unit == "1" else f"{name} [{unit}]"
 
 
 def influence(done: ScreenOutcome) -> Figure:
@@ -73,13 +86,14 @@ def influence(done: ScreenOutcome) -> Figure:
             at = 1 - share if is_largest else share
             curve = [factor * quantile(counts, at, is_smooth=True) for counts in part]
             ax.plot(centers, curve, style, color=color, lw=1.2, label=text)
-        own = field_unit(name.partition("[")[0])
-        ax.set_xlabel(name if own == "1" else f"{name}\n[{own}]")
+        ax.set_xlabel(axis_head(name).replace(" [", "\n[", 1))
         if len(labels):
             ax.set_xticks(centers, labels)
             ax.margins(x=0.2)
         elif centers[0] > 0 and centers[-1] > WIDE * centers[0]:
             figures.log_scale(ax, "x")
+        elif len(centers) <= FEW:
+            ax.set_xticks(centers)
         figures.log_scale(ax, "y")
     panels[0].set_ylabel(headed(screen.entry.replace("[", "\n[", 1), unit))
     figures.legend_above(figure, panels[0])

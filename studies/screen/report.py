@@ -12,26 +12,36 @@ from matplotlib.figure import Figure
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
-from studies.engine.results import ROUNDING
+from studies.engine.results import ROUNDING, SweepData
 from studies.extensions import options
 from studies.publish import REPORT, publish
-from studies.screen.plots import influence, values
-from studies.screen.run import ScreenOutcome
-from studies.screen.shards import axis_columns
+from studies.screen.plots import axis_head, influence, values
+from studies.screen.run import ScreenOutcome, all_failed
+from studies.screen.selection import Selection
+from studies.screen.shards import CANDIDATES, axis_columns
 from studies.screen.stored import BEST
 from studies.screen.tally import LEFT_OUT, quantile
 from studies.show.figures import styled
 from studies.show.pages import page
 from studies.show.units import headed, readable
-from studies.study.margin import ENOUGH, margin_text
+from studies.show.words import motion_text
+from studies.store import Variable
+from studies.study.margin import margin_text
 from studies.study.template import toml_text
 from studies.sweeps.plots import save_plot
+from studies.sweeps.show import counted_text
 
 VALUES, INFLUENCE = "values.png", "influence.png"
 #: Shares of the designs whose quantiles are shown.
 SHARES = (0.0001, 0.01, 0.1, 0.5, 0.9)
 #: Designs in the table.
 SHOWN = 20
+#: Kept designs count as alike if they differ by less than this share.
+ALIKE = 0.02
+#: Intervals an axis has at least where its ends are looked at.
+LEAST_INTERVALS = 5
+#: Gain margins for which the best design is shown [1].
+LEAST_MARGINS = (0, 1, 1.5, 2, 3, 4, 6, 10)
 
 
 def unit_of(done: ScreenOutcome) -> str:
@@ -60,14 +70,14 @@ def quantile_rows(done: ScreenOutcome) -> list[tuple[str, str]]:
     """Quantiles of the metric over all designs that ended well, best first, exact within 1 %."""
     sketch, is_largest = done.tally.sketch[0], done.screen.ranking[1]
     bound = "more" if is_largest else "less"
-    return [
-        (
-            f"{100 * share:g} %",
-            f"{quantity(done, quantile(sketch, 1 - share if is_largest else share))} or {bound}",
-        )
-        for share in SHARES
-        if share * sketch.sum() >= 1
-    ]
+    rows = []
+    for share in SHARES:
+        if share * sketch.sum() >= 1:
+            value = quantile(sketch, 1 - share if is_largest else share)
+            best = done.tally.value[0]  # which a sketch's rounding may exceed
+            value = min(value, best) if is_largest else max(value, best)
+            rows.append((f"{100 * share:g} %", f"{quantity(done, value)} or {bound}"))
+    return rows
 
 
 def summary_lines(done: ScreenOutcome) -> list[str]:
@@ -80,30 +90,90 @@ def summary_lines(done: ScreenOutcome) -> list[str]:
     n_without = int(tally.endings[status.OK] - tally.sketch[0].sum())
     if n_without:
         lines.append(f"{n_without} of those that are ok have no finite {screen.entry}")
-    if not len(tally.row):
-        return [*lines, "nothing is kept" if n_without else "no design ended well; nothing is kept"]
-    best, last = (quantity(done, tally.value[k]) for k in (0, -1))
+    if done.selection is None:
+        if n_without:
+            return [*lines, "nothing is kept"]
+        advice = all_failed(tally)
+        return [*lines, "no design ended well; nothing is kept" + (advice and f": {advice}")]
     half = quantity(done, quantile(tally.sketch[0], 0.5))
     half += " or less" if tally.value.min() < 0 else ""  # negative values count as 0
-    lines.append(
-        f"the best {len(tally.row)} by {screen.entry}: {best} to {last}; "
-        f"median of those that are ok: {half}"
-    )
-    lines += _uncontrolled_line(done)
-    margin = done.margin[~np.isnan(done.margin)]
-    if not margin.size:
-        return lines
-    unstable, safe = np.sum(margin < 1), np.sum(margin > ENOUGH)
-    lines.append(
-        f"of the best {margin.size}, {unstable} are unstable and {safe} have a gain margin above "
-        f"{ENOUGH:g}"
-    )
-    if safe:
-        case = int(np.argmax(done.margin[done.place] > ENOUGH))
-        first = done.place[case]
-        value, text = quantity(done, tally.value[first]), margin_text(done.margin[first])
-        lines.append(f"the best of these: case {case} of {BEST} with {value}, margin {text}")
+    lines += _selection_lines(done, done.selection, half)
+    return lines + _edge_lines(done, done.selection) + _uncontrolled_line(done)
+
+
+def _selection_lines(done: ScreenOutcome, selection: Selection, half: str) -> list[str]:
+    """Which designs are kept, what they are like, and what was passed over for them."""
+    screen, margin, value = done.screen, selection.margin, selection.value
+    lines = []
+    if done.n_kept:
+        best, last = value[selection.is_kept][[0, -1]]
+        which = f" with a gain margin of at least {screen.margin:g}" if screen.margin else ""
+        lines.append(
+            f"the best {done.n_kept:,}{which} by {screen.entry}: {quantity(done, best)} to "
+            f"{quantity(done, last)}; median of those that are ok: {half}"
+        )
+        first = int(np.argmax(selection.is_kept))
+        lines.append(f"case 0 of {BEST} has a gain margin of {margin_text(margin[first])}")
+        if abs(last - best) < ALIKE * abs(best):
+            lines.append(
+                f"these differ by less than {100 * ALIKE:g} %: rank them by the full model, or by "
+                "another metric"
+            )
+    n_unstable = int(np.sum(margin < 1))
+    passed = f"of the best {len(margin):,} judged, {n_unstable:,} are unstable"
+    if screen.margin:
+        passed += f" and {np.sum(margin < screen.margin) - n_unstable:,} more below that margin"
+    lines.append(passed)
+    if not done.n_kept:
+        largest = margin_text(np.nanmax(margin)) if np.isfinite(margin).any() else "none"
+        lines.append(
+            f"none has a gain margin of at least {screen.margin:g} (largest: {largest}), and "
+            "nothing is kept; ask for less with --resume --margin, or narrow the axes"
+        )
+    elif done.n_kept < screen.keep and screen.margin and len(done.tally.row) >= CANDIDATES:
+        lines.append(
+            f"{done.n_kept:,} of {screen.keep:,} are kept, as a screen judges no more than its "
+            f"best {CANDIDATES:,}"
+        )
     return lines
+
+
+def _edge_lines(done: ScreenOutcome, selection: Selection) -> list[str]:
+    """Axes at an end of which most of the kept designs are."""
+    if not done.n_kept:
+        return []
+    axes, columns, ends = done.screen.axes, axis_columns(selection.kept), []
+    for k, name in enumerate(axes.names):
+        last = len(axes.bounds[k])
+        if len(axes.labels[k]) or last + 1 < LEAST_INTERVALS:
+            continue
+        interval = axes.interval(k, columns[name])
+        for place, end in ((0, "lower"), (last, "upper")):
+            if np.mean(interval == place) > 0.5:
+                ends.append(f"the {end} end of {name}")
+    return [f"most of these are at {' and '.join(ends)}: widen it if you can"] if ends else []
+
+
+def _counted_text(done: ScreenOutcome) -> str:
+    """What the metric is taken over, in words."""
+    metric, screen = METRICS[done.screen.metric], done.screen
+    assert done.selection is not None
+    variable = Variable(np.empty(0), ("case", *metric.dims), metric.unit, metric.text)
+    table = done.selection.table
+    data = SweepData({screen.metric: variable}, {}, screen.spec, table, counted=screen.links)
+    return counted_text(data, screen.entry)
+
+
+def margin_rows(done: ScreenOutcome) -> list[tuple[str, str, str]]:
+    """What more margin costs: margins, how many judged candidates have them, and the best one."""
+    if done.selection is None:
+        return []
+    margin, value, rows = done.selection.margin, done.selection.value, []
+    for least in LEAST_MARGINS:
+        enough = np.flatnonzero(margin >= least)
+        if len(enough):
+            rows.append((f"{least:g}", f"{len(enough):,}", quantity(done, value[enough[0]])))
+    return rows
 
 
 def _uncontrolled_line(done: ScreenOutcome) -> list[str]:
@@ -131,7 +201,7 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
         drawings[VALUES] = values
         if screen.axes.names:
             drawings[INFLUENCE] = influence
-    rows = _best_rows(done) if len(tally.row) else []
+    rows = [] if done.selection is None else _best_rows(done)
     with publish(folder, stale=(VALUES, INFLUENCE)) as staging:
         with styled():
             for name, draw in drawings.items():
@@ -155,11 +225,14 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
                 "design",
                 headed(screen.entry, unit_of(done)),
                 "gain margin",
-                *screen.axes.names,
+                *(axis_head(name) for name in screen.axes.names),
             ),
             rows=rows,
-            is_robust=bool(np.any(done.margin > ENOUGH)),
-            enough=ENOUGH,
+            n_kept=done.n_kept,
+            margins=margin_rows(done),
+            motion=motion_text(screen.spec.study),
+            window=screen.spec.study.metrics,
+            counted=_counted_text(done) if rows else "",
             is_compared=done.uncontrolled is not None,
             lost=done.lost,
         )
@@ -167,22 +240,23 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
 
 
 def _best_rows(done: ScreenOutcome) -> list[tuple[str, ...]]:
-    """Of the best designs, those with margin enough; of all, if there are none."""
-    assert done.kept is not None
-    factor, place = readable(unit_of(done))[0], done.place
-    robust = np.flatnonzero(done.margin[place] > ENOUGH)
-    cases = (robust if len(robust) else np.arange(len(place)))[:SHOWN]
-    table = done.kept.rows(cases)
+    """The first cases that are kept; of all candidates, if none is."""
+    selection = done.selection
+    assert selection is not None
+    factor = readable(unit_of(done))[0]
+    is_shown = selection.is_kept if done.n_kept else np.ones(len(selection.value), bool)
+    shown = np.flatnonzero(is_shown)[:SHOWN]
+    table = selection.table.rows(shown)
     columns = axis_columns(table)
     return [
         (
-            str(case),
-            str(table.row[k]),
-            f"{factor * done.tally.value[place[case]]:.4g}",
-            margin_text(done.margin[place[case]]),
-            *(_shown(columns[name][k]) for name in done.screen.axes.names),
+            str(case) if done.n_kept else "",
+            str(table.row[case]),
+            f"{factor * selection.value[k]:.4g}",
+            margin_text(selection.margin[k]),
+            *(_shown(columns[name][case]) for name in done.screen.axes.names),
         )
-        for k, case in enumerate(cases)
+        for case, k in enumerate(shown)
     ]
 
 

@@ -17,16 +17,17 @@ from studies import config
 from studies.engine.folder import locked_folder
 from studies.engine.progress import Phases, duration_text
 from studies.engine.sweep import interrupts
-from studies.screen.margins import kept_margins, uncontrolled
-from studies.screen.shards import ScreenRequest, designs_table, shard_tally
+from studies.screen.selection import Selection, select, uncontrolled
+from studies.screen.shards import ScreenRequest, shard_tally
 from studies.screen.stored import begin, write_best, write_tally
 from studies.screen.tally import LEFT_OUT, Tally, merged
 from studies.show.units import count_text
 from studies.space.table import CaseTable, build_table
+from studies.study.labels import remedy
 
 T = TypeVar("T")
 
-PHASES = ("screen", "report")
+PHASES = ("screen", "margins", "report")
 
 
 class ScreenProgress:
@@ -112,15 +113,13 @@ class ScreenOutcome(NamedTuple):
     tally: Tally
     lost: dict[int, str]  # shards that were given up, and why
     is_interrupted: bool  # by Ctrl-C
-    kept: CaseTable | None  # cases of `best.toml`, best first; None: interrupted, or none
-    margin: np.ndarray  # gain margins of the designs kept, NaN: not judged, (k,)
+    selection: Selection | None  # of the candidates; None: interrupted, or there are none
     uncontrolled: float | None  # the metric without control; None: not known
 
     @property
-    def place(self) -> np.ndarray:
-        """Which of the designs kept each case of `best.toml` is, (n,)."""
-        assert self.kept is not None
-        return np.flatnonzero(np.isin(self.tally.row, self.kept.row))
+    def n_kept(self) -> int:
+        """Number of cases of `best.toml`."""
+        return 0 if self.selection is None else int(self.selection.is_kept.sum())
 
 
 def run_screen(
@@ -140,7 +139,7 @@ def run_screen(
         phases: of a longer command, with those of `PHASES`, in place of is_quiet.
 
     Returns:
-        ScreenOutcome; `best.toml` is there unless the run was interrupted or no design ended well.
+        ScreenOutcome; `best.toml` is there unless the run was interrupted or nothing is kept.
 
     Raises:
         StudyError: a fault of the sweep, the folder or the disk. Finished shards stay.
@@ -163,24 +162,51 @@ def run_screen(
                 lost[shard] = answer
                 phases.say(f"shard {shard} is left out: {answer}")
                 continue
+            if not is_done.any() and (advice := all_failed(answer)):
+                phases.say(f"none of the first designs ended well: {advice}")
             tally = merged(tally, answer, *screen.ranking)
             is_done[shard] = True
             write_tally(out, screen, is_done, tally)
-        is_interrupted = stop.is_set() and not is_done.all()
-        kept = None if is_interrupted or not len(tally.row) else designs_table(screen, tally.row)
-        if kept is not None:
-            write_best(out, screen, kept)
-    margin, without = np.full(len(tally.row), np.nan), None
-    if kept is not None:
-        margin[np.isin(tally.row, kept.row)] = kept_margins(screen, kept)
-        without = uncontrolled(screen, kept)
+        selection, without = None, None
+        if not stop.is_set() and len(tally.row):
+            selection = _selected(screen, tally, stop, phases)
+        is_interrupted = stop.is_set() and selection is None
+        if selection is not None:
+            without = uncontrolled(screen, selection.table)
+            write_best(out, screen, selection.kept)
     return ScreenOutcome(
         screen=screen,
         is_done=is_done,
         tally=tally,
         lost=lost,
         is_interrupted=is_interrupted,
-        kept=kept,
-        margin=margin,
+        selection=selection,
         uncontrolled=without,
     )
+
+
+def all_failed(tally: Tally) -> str:
+    """Why designs failed, most frequent first, and what helps; "" if any ended well."""
+    counts = tally.endings[:LEFT_OUT]
+    if counts[status.OK] or not counts.any():
+        return ""
+    codes = [int(code) for code in np.argsort(-counts, kind="stable") if counts[code]]
+    reasons = [f"{counts[code]:,} {status.REASONS[code]}" for code in codes]
+    return "; ".join(reasons + [advice for advice in map(remedy, codes[:1]) if advice])
+
+
+def _selected(
+    screen: ScreenRequest, tally: Tally, stop: threading.Event, phases: Phases
+) -> Selection | None:
+    phases.begin("margins", f"of {count_text(len(tally.row), 'candidate')}, best first")
+    wanted = f" with a gain margin of at least {screen.margin:g}" if screen.margin else ""
+
+    began = time.perf_counter()
+
+    def tell(n_judged: int, n_kept: int, total: int) -> None:
+        needed = min(total, n_judged * screen.keep / max(n_kept, 1))
+        rest = (time.perf_counter() - began) * max(needed / n_judged - 1, 0)
+        text = f"{n_judged:,} of {total:,} judged, {n_kept:,}{wanted}"
+        phases.advance(n_judged, total, text, f"about {duration_text(rest)}")
+
+    return select(screen, tally, stop, tell)

@@ -14,26 +14,30 @@ from studies.engine.chunks import Done, LocalRunner
 from studies.engine.columns import labelled
 from studies.engine.plan import local_layout, most_lanes, plan_groups
 from studies.engine.progress import Phases, Reporter
-from studies.engine.results import SweepData, direction, metric_values
+from studies.engine.results import SweepData, counted_links, direction, metric_values
 from studies.engine.stored import accurate, chunk_arrays, inaccurate
 from studies.errors import StudyError, field_error
 from studies.screen.tally import Axes, Tally, divided, merged, nothing, tally_of
-from studies.space.axes import LIMIT
 from studies.space.designs import LazyCases, design_of
 from studies.space.methods import METHODS
 from studies.space.spec import SweepSpec
 from studies.space.table import CaseTable, as_numbers, build_table, metric_sizes
 from studies.study.entries import parse_entries
 from studies.study.fields import Columns
+from studies.study.margin import ENOUGH, HIGHEST
 
-#: Designs of a shard.
-SHARD = 2**18
+#: Fewest and most designs of a shard.
+SHARD = (2**14, 2**18)
+#: Shards of a screen, if their size allows it: what an interruption loses is one of them.
+SHARDS = 64
 #: Designs side by side: preparing many at once is faster, and the linear model needs little memory.
 LANES = 512
 #: Designs by whose values axes are divided.
 TRIED = 2**12
 #: Most designs.
 MOST = 10**12
+#: Best designs of a screen, whatever their margins: those to be kept are chosen among them.
+CANDIDATES = 100_000
 
 
 class ScreenRequest(NamedTuple):
@@ -42,8 +46,10 @@ class ScreenRequest(NamedTuple):
     spec: SweepSpec
     by: str  # metric, or entry of one; a minus in front: the worst first
     keep: int  # most designs kept
+    margin: float  # least gain margin of these [1]; 0: any
     n_designs: int  # of the sweep
     axes: Axes
+    links: np.ndarray  # which of them a metric without an index of them counts, (n_links,)
     shard_size: int  # designs; the last shard may have fewer
 
     @property
@@ -58,8 +64,8 @@ class ScreenRequest(NamedTuple):
 
     @property
     def ranking(self) -> tuple[int, bool]:
-        """How many designs are kept, and whether large values are the best."""
-        return self.keep, direction(self.by) == "largest"
+        """How many candidates a tally holds, and whether large values are the best."""
+        return CANDIDATES, direction(self.by) == "largest"
 
     @property
     def n_shards(self) -> int:
@@ -76,6 +82,7 @@ def screen_of(
     spec: SweepSpec,
     by: str = "",
     keep: int = 1000,
+    margin: float = ENOUGH,
     fidelity: str = "linear",
     shard_size: int = 0,
 ) -> ScreenRequest:
@@ -85,8 +92,9 @@ def screen_of(
         spec: the sweep.
         by: metric, or entry of one; "": what the sweep ranks by.
         keep: most designs kept.
+        margin: least gain margin of these [1]; 0: any.
         fidelity: model of the runs, "linear" or "full".
-        shard_size: designs of a shard; 0: `SHARD`.
+        shard_size: designs of a shard; 0: by their number.
 
     Raises:
         StudyError: a sweep that cannot be screened, or a bad metric.
@@ -102,8 +110,10 @@ def screen_of(
         default = type(spec.sweep).model_fields[name].default
         if value != default:
             raise field_error(f"sweep.{name}", value, f"{default!r} in a screen")
-    if not 1 <= keep <= LIMIT:
-        raise field_error("--keep", keep, f"1 to {LIMIT} designs")
+    if not 1 <= keep <= CANDIDATES:
+        raise field_error("--keep", keep, f"1 to {CANDIDATES} designs")
+    if not 0 <= margin < HIGHEST:
+        raise field_error("--margin", margin, f"0 to less than {HIGHEST:g}")
     design = design_of(spec.root, spec.study, spec.sweep.seed)
     if design.size > MOST:
         raise StudyError(f"sweep: {design.size:.3g} designs; allowed: up to {MOST:.0e} in a screen")
@@ -121,10 +131,16 @@ def screen_of(
         spec=spec,
         by=by,
         keep=keep,
+        margin=margin,
         n_designs=design.size,
         axes=divided(_distinct(axis_columns(table))),
-        shard_size=shard_size or SHARD,
+        links=counted_links(SweepData({}, {}, spec, table)),
+        shard_size=shard_size or _shard_size(design.size),
     )
+
+
+def _shard_size(n_designs: int) -> int:
+    return int(np.clip(1 << (n_designs // SHARDS).bit_length(), *SHARD))
 
 
 def _tried(design: LazyCases) -> np.ndarray:
@@ -218,7 +234,8 @@ def shard_tally(
 def _chunk_tally(screen: ScreenRequest, table: CaseTable, done: Done) -> Tally:
     part, arrays = table.rows(done.chunk.rows), chunk_arrays(table, done, [screen.metric])
     variables = {name: labelled(name, data) for name, data in arrays.items() if name != "case_id"}
-    value = metric_values(SweepData(variables, {}, screen.spec, part), screen.entry)
+    data = SweepData(variables, {}, screen.spec, part, counted=screen.links)
+    value = metric_values(data, screen.entry)
     columns = axis_columns(part)
     return tally_of(
         part.row, arrays["status"], np.asarray(value, float), columns, screen.axes, *screen.ranking

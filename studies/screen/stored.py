@@ -11,7 +11,7 @@ import numpy as np
 from studies.engine.folder import keep_request, make_manifest
 from studies.errors import StudyError
 from studies.publish import replacing
-from studies.screen.shards import ScreenRequest
+from studies.screen.shards import CANDIDATES, ScreenRequest
 from studies.screen.tally import BUCKETS, GROWTH, LEAST, N_ENDINGS, Tally, nothing
 from studies.space.axes import LABELS
 from studies.space.table import CaseTable, as_python
@@ -23,7 +23,6 @@ REQUEST, TALLY, BEST = "screen.json", "screen.h5", "best.toml"
 _CHECKED = {
     "spec": "sweep",
     "by": "--by",
-    "keep": "--keep",
     "fidelity": "--fidelity",
     "shard_size": "size of shards",
     "code": "program",
@@ -82,8 +81,8 @@ def read_tally(folder: Path, screen: ScreenRequest) -> tuple[np.ndarray, Tally]:
     if attributes.get("digest") != _digest(screen, is_done, tally):
         raise _damaged(path, "not what was written for this screen")
     is_row = (tally.row >= 0) & (tally.row < screen.n_designs)
-    if tally.row.shape != tally.value.shape or len(tally.row) > screen.keep or not is_row.all():
-        raise _damaged(path, "designs kept")
+    if tally.row.shape != tally.value.shape or len(tally.row) > CANDIDATES or not is_row.all():
+        raise _damaged(path, "candidates")
     return is_done, tally
 
 
@@ -91,7 +90,6 @@ def _asked(screen: ScreenRequest) -> dict[str, Any]:
     """What is asked of a screen, next to its sweep."""
     return {
         "by": screen.by,
-        "keep": screen.keep,
         "fidelity": screen.spec.sweep.fidelity,
         "shard_size": screen.shard_size,
     }
@@ -117,7 +115,7 @@ def write_tally(folder: Path, screen: ScreenRequest, is_done: np.ndarray, tally:
     variables = {
         "is_done": Variable(is_done, ("shard",), "1", "whether a shard is in the tally"),
         "endings": Variable(tally.endings, ("ending",), "1", "designs by status code"),
-        "row": Variable(tally.row, ("place",), "1", "number of a kept design, best first"),
+        "row": Variable(tally.row, ("place",), "1", "number of a candidate, best first"),
         "value": Variable(tally.value, ("place",), "SI", f"{screen.entry} there"),
         "sketch": Variable(tally.sketch, ("part", "bucket"), "1", "designs by value"),
         "part": Variable(np.array(names), ("part",), "1", "which designs: interval of an axis"),
@@ -159,6 +157,9 @@ def best_sweep(screen: ScreenRequest, kept: CaseTable) -> str:
 
 
 def write_best(folder: Path, screen: ScreenRequest, kept: CaseTable) -> None:
-    """Write `best.toml`, whole or not at all."""
+    """Write `best.toml`, whole or not at all; remove an older one where nothing is kept."""
+    if not len(kept):
+        (folder / BEST).unlink(missing_ok=True)
+        return
     with replacing(folder / BEST) as temporary:
         temporary.write_text(best_sweep(screen, kept), encoding="utf-8")

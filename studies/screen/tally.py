@@ -31,7 +31,7 @@ class Tally(NamedTuple):
     """Some designs of a screen, reduced."""
 
     endings: np.ndarray  # number of designs by status code, (N_ENDINGS,)
-    row: np.ndarray  # of the best designs, best first, (k,)
+    row: np.ndarray  # of the best designs, the candidates, best first, (k,)
     value: np.ndarray  # of the metric there, (k,)
     sketch: np.ndarray  # designs by value, in all and by interval of every axis, (s, BUCKETS)
 
@@ -157,7 +157,7 @@ def _best(row: np.ndarray, value: np.ndarray, keep: int, is_largest: bool) -> np
     """Which designs are kept, best first; of equal ones, the earliest."""
     cost = -value if is_largest else value
     chosen = np.arange(len(row))
-    if len(row) > 4 * keep:
+    if len(row) > keep:
         chosen = np.flatnonzero(cost <= np.partition(cost, keep - 1)[keep - 1])
     return np.asarray(chosen[np.lexsort((row[chosen], cost[chosen]))[:keep]])
 

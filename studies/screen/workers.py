@@ -30,7 +30,6 @@ class ShardJob(NamedTuple):
     precision: str
     spec: str  # the sweep as JSON
     by: str
-    keep: int
     fidelity: str
     shard_size: int
     shard: int
@@ -68,7 +67,6 @@ class ClusterScreener:
                 precision=config.origin()["precision"],
                 spec=spec,
                 by=screen.by,
-                keep=screen.keep,
                 fidelity=screen.spec.sweep.fidelity,
                 shard_size=screen.shard_size,
                 shard=shard,
@@ -91,7 +89,7 @@ def run_shard(job: ShardJob) -> ShardDone:
         StudyError: the worker has other versions than the client.
     """
     with working(job.identity, job.precision) as worker:
-        screen = _screen(job.spec, job.by, job.keep, job.fidelity, job.shard_size)
+        screen = _screen(job.spec, job.by, job.fidelity, job.shard_size)
         table = build_table(screen.spec, screen.rows(job.shard))
         tally = shard_tally(screen, job.shard, table, threading.Event())
         assert tally is not None  # nothing stops it
@@ -99,5 +97,5 @@ def run_shard(job: ShardJob) -> ShardDone:
 
 
 @lru_cache(maxsize=1)
-def _screen(spec: str, by: str, keep: int, fidelity: str, shard_size: int) -> ScreenRequest:
-    return screen_of(parse_sweep(json.loads(spec)), by, keep, fidelity, shard_size)
+def _screen(spec: str, by: str, fidelity: str, shard_size: int) -> ScreenRequest:
+    return screen_of(parse_sweep(json.loads(spec)), by, fidelity=fidelity, shard_size=shard_size)

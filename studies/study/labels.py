@@ -62,8 +62,11 @@ RESERVED = (
 )
 
 
-#: What to change where a run ends at a limit of the machine.
+#: What to change where a run ends at a limit of the machine, or ends too early.
 _REMEDIES = {
+    status.SHAPER_TOO_LONG: "lengthen the run (run.duration)",
+    status.WINDOW_TOO_LONG: "lengthen the run (run.duration), or shorten the window "
+    "(metrics.residual_delay, metrics.residual_length)",
     status.CLIPPED: "lower electronics.conditioner_gain, or move more slowly (motion.move_time)",
     status.SATURATED: "lower control.gain_factor, or move more slowly (motion.move_time)",
     status.MOTORS_SATURATED: "move more slowly (motion.move_time), or raise drive.force_limit",
