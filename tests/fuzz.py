@@ -359,5 +359,7 @@ def fuzz_all(seconds: float, folder: Path, names: list[str]) -> int:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 3:
+        sys.exit(__doc__)
     seconds, folder, *names = sys.argv[1:]
     sys.exit(fuzz_all(float(seconds), Path(folder), names or list(TARGETS)))

@@ -289,7 +289,7 @@ def test_a_killed_sweep_runs_only_what_is_left(tmp_path, mixed):
     assert_same(arrays(mixed[0]), arrays(out))
 
 
-def partly_done(out, spec=None):
+def partly_done(out, spec=None, number=signal.SIGINT):
     """A sweep that stopped after two chunks, as Ctrl-C leaves it."""
     spec = spec or small_spec()
     from studies.engine import sweep as module
@@ -300,7 +300,7 @@ def partly_done(out, spec=None):
         original(self, *given)
         count[0] += 1
         if count[0] == 2:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
             time.sleep(0.01)
 
     module.SweepFolder.write_chunk = write
@@ -310,12 +310,13 @@ def partly_done(out, spec=None):
         module.SweepFolder.write_chunk = original
 
 
-def test_ctrl_c_finishes_the_chunk_and_says_so(tmp_path, mixed):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["ctrl-c", "batch"])
+def test_a_signal_finishes_the_chunk_and_says_so(tmp_path, mixed, number):
     out = tmp_path / "s"
-    before = signal.getsignal(signal.SIGINT)  # a shell starts what runs in its background without
-    outcome = partly_done(out)
+    before = signal.getsignal(number)  # a shell starts what runs in its background without
+    outcome = partly_done(out, number=number)
     assert outcome.is_interrupted and 32 <= outcome.n_done < 72
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(number) is before
     data = read_sweep(out)
     assert np.sum(data["status"] >= 0) == outcome.n_done
     assert np.isnan(data["residual_rms"][data["status"] < 0]).all()

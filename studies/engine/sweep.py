@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -346,19 +346,28 @@ def _check_whole(table: CaseTable, rows: np.ndarray, done: np.ndarray, out: Path
 
 @contextmanager
 def interrupts() -> Iterator[threading.Event]:
-    """An event that Ctrl-C sets; a second Ctrl-C ends the process at once."""
+    """An event that Ctrl-C or SIGTERM sets; a second one ends the process at once.
+
+    SIGTERM is what batch systems send some time before they end a job.
+    """
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
+    before: dict[int, Any] = {}
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler or signal.SIG_DFL)
 
     def ask(*_: object) -> None:
         stop.set()
-        signal.signal(signal.SIGINT, before)
+        restore()
         print("studies: stopping after what is under way; Ctrl-C again: at once", file=sys.stderr)
 
-    before = signal.signal(signal.SIGINT, ask)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        before[number] = signal.signal(number, ask)
     try:
         yield stop
     finally:
-        signal.signal(signal.SIGINT, before)
+        restore()

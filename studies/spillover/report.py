@@ -16,6 +16,7 @@ from studies.engine.fast_motion import FAST, WINDOW
 from studies.show.document import json_text
 from studies.show.pages import page
 from studies.show.sketch import CAPTION
+from studies.show.words import motion_text
 from studies.spillover.certificate import Certificate, Spillover
 from studies.spillover.fast_move import ControlEffect
 from studies.spillover.plants import PlantVariant
@@ -128,6 +129,8 @@ def report(certificate: Certificate, images: Path | None = None) -> str:
         worst=certificate.plants[certificate.worst],
         share=margin / certificate.required,
         total=int(certificate.exists.sum()),
+        n_left_out=int((~certificate.exists).sum()),
+        motion=motion_text(study),
         good=int(certificate.passes[certificate.exists].sum()),
         links="+".join(str(i + 1) for i, is_on in enumerate(study.control.links) if is_on),
         fewest=certificate.plants[0, 0, 0].n_modes,
