@@ -49,7 +49,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         resume: Annotated[
             bool, typer.Option("--resume", help="go on with the screen in this folder, if any")
         ] = False,
-        quiet: Annotated[bool, typer.Option("--quiet", help="hide progress")] = False,
+        quiet: Annotated[
+            bool, typer.Option("--quiet", help="print neither progress nor results")
+        ] = False,
         precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
         scheduler: Scheduler = None,
         local_workers: LocalWorkers = None,

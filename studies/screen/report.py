@@ -60,7 +60,11 @@ def ending_rows(done: ScreenOutcome) -> list[tuple[str, str, str]]:
     endings, rows = done.tally.endings, []
     for code in np.argsort(-endings, kind="stable"):
         if endings[code]:
-            reason = "left out by where, or twice" if code == LEFT_OUT else status.REASONS[code]
+            reason = (
+                "left out by sweep.where, or the same as another"
+                if code == LEFT_OUT
+                else status.REASONS[code]
+            )
             share = f"{100 * endings[code] / done.tally.n_designs:.3g} %"
             rows.append((f"{endings[code]:,}", share, reason))
     return rows

@@ -46,7 +46,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         dry_run: Annotated[
             bool, typer.Option("--dry-run", help="show what would run, and how long it would take")
         ] = False,
-        quiet: Annotated[bool, typer.Option("--quiet", help="hide progress")] = False,
+        quiet: Annotated[
+            bool, typer.Option("--quiet", help="print neither progress nor results")
+        ] = False,
         report: Annotated[bool, typer.Option("--report", help="also write report.html")] = False,
         explore: Annotated[
             bool, typer.Option("--explore", help="also write explorer.html, to look at all cases")
