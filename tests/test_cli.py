@@ -537,3 +537,12 @@ print(*sorted(lacking))
         "studies.screen.workers",
         "studies.tuning.workers",
     ], run.stderr
+
+
+def test_workers_are_named_again_as_they_were():
+    """In the command that goes on: what differs from the defaults, if workers are asked for."""
+    from studies.cluster.connect import TIMEOUT, Workers
+
+    assert Workers(None, 2, TIMEOUT).options == " --local-workers 2"
+    assert Workers("tcp://a:1", None, 90.0).options == " --scheduler tcp://a:1 --worker-timeout 90"
+    assert Workers(None, None, 90.0).options == ""

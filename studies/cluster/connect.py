@@ -46,6 +46,8 @@ WorkerTimeout = Annotated[
 ]
 
 
+#: Default of `WorkerTimeout` [s].
+TIMEOUT = 600.0
 #: Time limit for the scheduler to answer [s].
 PATIENCE = 15
 #: That for all workers to tell their versions, which computing does not delay [s].
@@ -62,8 +64,13 @@ class Workers(NamedTuple):
     @property
     def options(self) -> str:
         """These as command-line options, "" for none."""
-        named = (("--scheduler", self.scheduler), ("--local-workers", self.local))
-        return "".join(f" {name} {value}" for name, value in named if value is not None)
+        timeout = f"{self.timeout:g}" if self.are_named and self.timeout != TIMEOUT else None
+        named = {
+            "--scheduler": self.scheduler,
+            "--local-workers": self.local,
+            "--worker-timeout": timeout,
+        }
+        return "".join(f" {name} {value}" for name, value in named.items() if value is not None)
 
     @property
     def are_named(self) -> bool:

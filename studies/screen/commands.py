@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from studies.cluster.connect import LocalWorkers, Scheduler, Workers, WorkerTimeout, on_workers
+from studies.cluster.connect import (
+    TIMEOUT,
+    LocalWorkers,
+    Scheduler,
+    Workers,
+    WorkerTimeout,
+    on_workers,
+)
 from studies.config import start
 from studies.publish import REPORT, announce
 from studies.study.margin import ENOUGH
@@ -55,7 +62,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
         scheduler: Scheduler = None,
         local_workers: LocalWorkers = None,
-        worker_timeout: WorkerTimeout = 600.0,
+        worker_timeout: WorkerTimeout = TIMEOUT,
     ) -> None:
         """Find the best of up to a billion designs: keeps these, not all cases as a sweep does.
 

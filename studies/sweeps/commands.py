@@ -11,7 +11,14 @@ from typing import Annotated, TypeAlias
 import typer
 from rich.console import Console
 
-from studies.cluster.connect import LocalWorkers, Scheduler, Workers, WorkerTimeout, runner_for
+from studies.cluster.connect import (
+    TIMEOUT,
+    LocalWorkers,
+    Scheduler,
+    Workers,
+    WorkerTimeout,
+    runner_for,
+)
 from studies.config import start
 from studies.errors import StudyError
 from studies.publish import EXPLORER, REPORT, announce
@@ -56,7 +63,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
         scheduler: Scheduler = None,
         local_workers: LocalWorkers = None,
-        worker_timeout: WorkerTimeout = 600.0,
+        worker_timeout: WorkerTimeout = TIMEOUT,
         as_json: AsJson = False,
     ) -> None:
         """Run thousands of cases from one file; finished cases survive any interruption."""

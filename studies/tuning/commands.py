@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from studies.cluster.connect import (
+    TIMEOUT,
     LocalWorkers,
     Scheduler,
     Workers,
@@ -54,7 +55,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         quiet: Annotated[bool, typer.Option("--quiet", help="hide progress")] = False,
         scheduler: Scheduler = None,
         local_workers: LocalWorkers = None,
-        worker_timeout: WorkerTimeout = 600.0,
+        worker_timeout: WorkerTimeout = TIMEOUT,
     ) -> None:
         """Tune parameters of a study by gradients, within limits, for many machines at once."""
         from studies.engine.folder import TUNINGS, refuse_existing
