@@ -2,6 +2,7 @@
 
 import html
 import re
+import shutil
 import threading
 import warnings
 from shlex import quote
@@ -176,10 +177,16 @@ def whole(tmp_path_factory):
     return out, screened(out)
 
 
-def test_a_screen_has_the_values_of_a_sweep_by_the_linear_model(tmp_path):
-    done = screened(tmp_path / "screen", keep=200)
-    run_sweep(small_spec(SWEEP | {"fidelity": "linear"}), tmp_path / "sweep", is_quiet=True)
-    data = read_sweep(tmp_path / "sweep")
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory):
+    """The sweep of all designs by the linear model."""
+    out = tmp_path_factory.mktemp("sweep") / "all"
+    run_sweep(small_spec(SWEEP | {"fidelity": "linear"}), out, is_quiet=True)
+    return read_sweep(out)
+
+
+def test_a_screen_has_the_values_of_a_sweep_by_the_linear_model(swept, tmp_path):
+    done, data = screened(tmp_path / "screen", keep=200), swept
     value = dict(zip(data.table.row.tolist(), metric_values(data, SWEEP["by"]), strict=True))
     # the sweep judges stability as well, which a screen does not: unstable ones are kept here
     stable = set(data.table.row[data["status"] == status.OK].tolist())
@@ -218,13 +225,12 @@ def test_kept_designs_have_the_margins_of_the_sweep(whole, tmp_path):
     assert f"of the best {KEEP} judged, {np.sum(margin < 1)} are unstable" in summary_lines(done)
 
 
-def test_designs_with_the_margin_asked_for_are_kept(whole, tmp_path):
+def test_designs_with_the_margin_asked_for_are_kept(whole, swept, tmp_path):
     """The best of all that have it, as a sweep of all designs finds them; nothing runs again."""
     _, done = whole
-    run_sweep(small_spec(SWEEP | {"fidelity": "linear"}), tmp_path / "sweep", is_quiet=True)
-    data = read_sweep(tmp_path / "sweep")
-    out, value = tmp_path / "out", metric_values(data, SWEEP["by"])
-    screened(out)  # whatever the margins
+    data, out = swept, tmp_path / "out"
+    value = metric_values(data, SWEEP["by"])
+    shutil.copytree(whole[0], out)  # whatever the margins
     for margin in (1.0, 2.5, 4.0):
         is_wanted = (data["gain_margin"] >= margin) & (data["status"] == status.OK)
         order = np.flatnonzero(is_wanted)[np.argsort(value[is_wanted])][:KEEP]
