@@ -195,7 +195,8 @@ def test_a_certificate_s_sentences():
         f"# Spillover certificate passed: gain margin {shown}, 2 required",
         "is its controller stable on 11 plants that differ",
         f"**Result:** safe on 11 of 11 plants (1 more left out, see below): gain margin "
-        f"{shown} on the worst, 2 required; what goes unstable first: {found.breaking[found.worst]}.",
+        f"{shown} on the worst, 2 required; what goes unstable first: "
+        f"{found.breaking[found.worst]}.",
         "basis pinned_pinned, 2 controlled modes per link on links 1+3, gain factor 0.4;",
         f"Smallest margin: {shown}, on {at.basis}, {at.n_modes} modes per link, {at.mismatch}.",
         f"Margins with 2 and 5 plant modes per link differ by up to {100 * change:.2g} %.",
