@@ -190,6 +190,13 @@ def test_a_frozen_worker_does_not_hold_up_what_connects(cluster, monkeypatch):
         os.kill(frozen, signal.SIGCONT)
 
 
+def test_a_scheduler_that_goes_is_said(cluster):
+    """Wherever it is missed: here where the workers are counted."""
+    workers = Workers(str(cluster.scheduler), None, 60.0)
+    with pytest.raises(StudyError, match="the scheduler is gone"), connected(workers, print):
+        raise CommClosedError("ConnectionPool closing.")
+
+
 @pytest.mark.long
 def test_a_tuning_has_the_same_slopes(cluster):
     spec = tuning(GAIN, starts=3)

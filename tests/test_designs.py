@@ -260,12 +260,30 @@ def test_the_same_links_count_for_all_designs(tmp_path):
     links = [[True, False, False], [False, True, False], [True, True, False]]
     sweep = {"method": "grid", "axes": {"control.links": links, "gain": gain}, "by": "residual_rms"}
     done = screened(tmp_path / "out", small_spec(sweep), shard_size=8)
-    assert done.screen.links.tolist() == [True, True, False]
+    assert done.screen.spec.sweep.links == (1, 2)
     run_sweep(small_spec(sweep | {"fidelity": "linear"}), tmp_path / "sweep", is_quiet=True)
     data = read_sweep(tmp_path / "sweep")
     value = dict(zip(data.table.row.tolist(), metric_values(data, "residual_rms"), strict=True))
     expected = [value[row] for row in done.tally.row.tolist()]
     np.testing.assert_allclose(done.tally.value, expected, rtol=1e-9)
+    # so that those that are kept compare when they are run alone
+    assert load_sweep(tmp_path / "out" / BEST).sweep.links == (1, 2)
+    alone = small_spec(
+        sweep | {"axes": {"control.links": links[:1], "gain": gain}, "links": [1, 2]}
+    )
+    run_sweep(alone, tmp_path / "alone", is_quiet=True)
+    all_rows = small_spec(sweep | {"fidelity": "full"})
+    run_sweep(all_rows, tmp_path / "full", is_quiet=True)
+    some, whole = (
+        metric_values(read_sweep(tmp_path / name), "residual_rms") for name in ("alone", "full")
+    )
+    np.testing.assert_allclose(some, whole[: len(some)], rtol=1e-9)
+
+
+def test_links_that_a_machine_lacks_are_refused():
+    for links in ([4], [0], [1, 1]):
+        with pytest.raises(StudyError, match="sweep.links = .*allowed: each of 1, 2, 3 once"):
+            small_spec(SWEEP | {"links": links})
 
 
 class Stopped(LocalScreener):

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeVar
 
 import typer
 
-from studies.cluster.watch import wait_for_workers
+from studies.cluster.watch import GONE, wait_for_workers
 from studies.config import usable_cores
 from studies.errors import StudyError, field_error
 from studies.reading import read_json
@@ -126,7 +126,7 @@ def connected(workers: Workers, on_progress: Callable[[str], None]) -> Iterator[
 
     Raises:
         StudyError: no extra `cluster`, no such scheduler, no worker, workers of other versions or
-            without an answer.
+            without an answer, or the scheduler goes meanwhile.
     """
     option = "--local-workers" if workers.scheduler is None else "--scheduler"
     if workers.scheduler is not None and workers.local is not None:
@@ -147,12 +147,17 @@ def connected(workers: Workers, on_progress: Callable[[str], None]) -> Iterator[
         if workers.scheduler is None
         else _remote_cluster(workers.scheduler, on_progress)
     )
+    from distributed.comm.core import CommClosedError
+
     with cluster as client:
-        if not client.ncores():
-            on_progress("waiting for a worker to join")
-        wait_for_workers(client)
-        refuse_other_versions(client)
-        yield client
+        try:
+            if not client.ncores():
+                on_progress("waiting for a worker to join")
+            wait_for_workers(client)
+            refuse_other_versions(client)
+            yield client
+        except CommClosedError:  # while workers were waited for, or asked for something
+            raise StudyError(GONE) from None
 
 
 @contextmanager

@@ -359,9 +359,10 @@ def refuse_existing(path: Path, content: Content, is_resumed: bool) -> None:
     except OSError as error:
         raise StudyError(f"--out {path}: cannot write there ({error.strerror})") from None
     if is_there and not is_resumed:
+        extend = " or to extend it" if content is SWEEPS else ""
         raise StudyError(
-            f"--out {path}: holds {content.what} already; add --resume to go on with it or to "
-            "extend it, or name a new folder"
+            f"--out {path}: holds {content.what} already; add --resume to go on with it{extend}, "
+            "or name a new folder"
         )
 
 
@@ -385,6 +386,7 @@ def _check_content(folder: SweepFolder, manifest: dict[str, Any], is_resumed: bo
         {
             "metrics": sweep.get("metrics", []),
             "fidelity": sweep.get("fidelity", "full"),
+            "links": sweep.get("links", []),
             "screen.by": sweep.get("screen", {}).get("by"),
         }
         for sweep in (old["spec"]["sweep"], manifest["spec"]["sweep"])

@@ -51,7 +51,6 @@ class SweepData:
     spec: SweepSpec
     cases: CaseTable | None = None  # where they are at hand, or not all of the sweep's
     baseline: dict[str, Variable] = field(default_factory=dict)  # without control; {}: not known
-    counted: np.ndarray | None = None  # links that metrics count; None: from its cases
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self.variables[name].data
@@ -218,8 +217,8 @@ def uncontrolled_value(data: SweepData, name: str) -> float | None:
 def metric_values(data: SweepData, name: str) -> np.ndarray:
     """One number per case: a metric, an entry of it, or a field, (n,).
 
-    A metric or condition number with more axes counts with its largest value over the links that
-    any case controls: `residual_rms` is that of the worst link and its worst station,
+    A metric or condition number with more axes counts with its largest value over the links of
+    `counted_links`: `residual_rms` is that of the worst link and its worst station,
     `residual_rms[link=3]` that of the worst station of link 3, controlled or not. Of poses, x and y
     count; `pose_error_peak[2]` is the angle. Indices without a name count from 0. A field that does
     not vary has the same value in every case.
@@ -330,12 +329,13 @@ def _worst(
 
 
 def counted_links(data: SweepData) -> np.ndarray:
-    """Links that a metric counts: those that any case controls, all if none does, (n,).
+    """Links that a metric counts, (n,).
 
-    The same for all cases; otherwise fewer controlled links would look like less vibration.
+    Those of `sweep.links`, else those that any case controls, all if none does: the same for all
+    cases; otherwise fewer controlled links would look like less vibration.
     """
-    if data.counted is not None:
-        return data.counted
+    if named := data.spec.sweep.links:
+        return np.isin(np.arange(data.spec.study.n_links) + 1, named)
     is_counted = np.any(controlled(data.table), axis=0)
     return is_counted if is_counted.any() else np.ones_like(is_counted)
 

@@ -84,7 +84,12 @@ def influence(done: ScreenOutcome) -> Figure:
         style = "o" if len(labels) else "-"
         for (share, text), color in zip(curves, figures.SERIES, strict=False):
             at = 1 - share if is_largest else share
-            curve = [factor * quantile(counts, at, is_smooth=True) for counts in part]
+            curve = [
+                factor * quantile(counts, at, is_smooth=True)
+                if share * counts.sum() >= 1
+                else np.nan
+                for counts in part
+            ]
             ax.plot(centers, curve, style, color=color, lw=1.2, label=text)
         ax.set_xlabel(axis_head(name).replace(" [", "\n[", 1))
         if len(labels):

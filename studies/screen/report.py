@@ -26,12 +26,17 @@ from studies.show.pages import page
 from studies.show.units import headed, readable
 from studies.show.words import motion_text
 from studies.store import Variable
-from studies.study.margin import margin_text
+from studies.study.margin import ENOUGH, margin_text
 from studies.study.template import toml_text
 from studies.sweeps.plots import save_plot
 from studies.sweeps.show import counted_text
 
 VALUES, INFLUENCE = "values.png", "influence.png"
+#: What statuses of a screen do not say.
+LATER = (
+    " (what saturated or clipped may have an unstable loop: stability is judged later, of the best "
+    "that are ok)"
+)
 #: Shares of the designs whose quantiles are shown.
 SHARES = (0.0001, 0.01, 0.1, 0.5, 0.9)
 #: Designs in the table.
@@ -91,6 +96,8 @@ def summary_lines(done: ScreenOutcome) -> list[str]:
         f"{tally.n_designs:,} designs: "
         + "; ".join(f"{number} {reason}" for number, _, reason in ending_rows(done))
     ]
+    if tally.endings[[status.SATURATED, status.CLIPPED]].any():
+        lines[0] += LATER
     n_without = int(tally.endings[status.OK] - tally.sketch[0].sum())
     if n_without:
         lines.append(f"{n_without} of those that are ok have no finite {screen.entry}")
@@ -164,7 +171,7 @@ def _counted_text(done: ScreenOutcome) -> str:
     assert done.selection is not None
     variable = Variable(np.empty(0), ("case", *metric.dims), metric.unit, metric.text)
     table = done.selection.table
-    data = SweepData({screen.metric: variable}, {}, screen.spec, table, counted=screen.links)
+    data = SweepData({screen.metric: variable}, {}, screen.spec, table)
     return counted_text(data, screen.entry)
 
 
@@ -186,8 +193,13 @@ def _uncontrolled_line(done: ScreenOutcome) -> list[str]:
         return []
     sign = -1 if done.screen.ranking[1] else 1
     lead = sign * (done.uncontrolled - done.tally.value[0])
-    text = f"{done.screen.entry} of the baseline without control: "
+    model = "linear" if done.screen.spec.sweep.fidelity == "linear" else "full"
+    text = f"{done.screen.entry} of the baseline without control, by the {model} model: "
     text += quantity(done, done.uncontrolled)
+    kept = done.selection.value[done.selection.is_kept] if done.selection else np.zeros(0)
+    n_worse = int(np.sum(sign * (kept - done.uncontrolled) > -ROUNDING * abs(done.uncontrolled)))
+    if n_worse and lead > ROUNDING * abs(done.uncontrolled):
+        text += f"; {n_worse:,} of the {len(kept):,} kept are no better"
     if lead <= ROUNDING * abs(done.uncontrolled):
         text += f"; no design is {'above' if sign < 0 else 'below'} it"
     return [text]
@@ -233,6 +245,7 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
             ),
             rows=rows,
             n_kept=done.n_kept,
+            enough=ENOUGH,
             margins=margin_rows(done),
             motion=motion_text(screen.spec.study),
             window=screen.spec.study.metrics,

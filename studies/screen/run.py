@@ -199,14 +199,14 @@ def _selected(
     screen: ScreenRequest, tally: Tally, stop: threading.Event, phases: Phases
 ) -> Selection | None:
     phases.begin("margins", f"of {count_text(len(tally.row), 'candidate')}, best first")
-    wanted = f" with a gain margin of at least {screen.margin:g}" if screen.margin else ""
+    wanted = f", {{:,}} with a gain margin of at least {screen.margin:g}" if screen.margin else ""
 
     began = time.perf_counter()
 
     def tell(n_judged: int, n_kept: int, total: int) -> None:
         needed = min(total, n_judged * screen.keep / max(n_kept, 1))
         rest = (time.perf_counter() - began) * max(needed / n_judged - 1, 0)
-        text = f"{n_judged:,} of {total:,} judged, {n_kept:,}{wanted}"
+        text = f"{n_judged:,} of {total:,} judged{wanted.format(n_kept)}"
         phases.advance(n_judged, total, text, f"about {duration_text(rest)}")
 
     return select(screen, tally, stop, tell)

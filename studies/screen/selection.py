@@ -112,5 +112,5 @@ def uncontrolled(screen: ScreenRequest, kept: CaseTable) -> float | None:
     if run.status not in status.FINISHED:
         return None
     baseline = metric_variables(run.result)
-    data = SweepData({}, {}, screen.spec, kept, baseline, screen.links)
+    data = SweepData({}, {}, screen.spec, kept, baseline)
     return uncontrolled_value(data, screen.entry)

@@ -43,13 +43,12 @@ CANDIDATES = 100_000
 class ScreenRequest(NamedTuple):
     """What is screened, and what is kept."""
 
-    spec: SweepSpec
+    spec: SweepSpec  # its `links` are the same for all designs
     by: str  # metric, or entry of one; a minus in front: the worst first
     keep: int  # most designs kept
     margin: float  # least gain margin of these [1]; 0: any
     n_designs: int  # of the sweep
     axes: Axes
-    links: np.ndarray  # which of them a metric without an index of them counts, (n_links,)
     shard_size: int  # designs; the last shard may have fewer
 
     @property
@@ -125,6 +124,8 @@ def screen_of(
             "narrow the axes to where it holds"
         )
     parse_entries(by.removeprefix("-"), "--by", metric_sizes(table))
+    links = (np.flatnonzero(counted_links(SweepData({}, {}, spec, table))) + 1).tolist()
+    spec = spec._replace(sweep=spec.sweep.model_copy(update={"links": tuple(links)}))
     if inaccurate([by.removeprefix("-").partition("[")[0]]):
         raise field_error("--by", by, f"with float32 {accurate()}")
     return ScreenRequest(
@@ -134,7 +135,6 @@ def screen_of(
         margin=margin,
         n_designs=design.size,
         axes=divided(_distinct(axis_columns(table))),
-        links=counted_links(SweepData({}, {}, spec, table)),
         shard_size=shard_size or _shard_size(design.size),
     )
 
@@ -234,8 +234,7 @@ def shard_tally(
 def _chunk_tally(screen: ScreenRequest, table: CaseTable, done: Done) -> Tally:
     part, arrays = table.rows(done.chunk.rows), chunk_arrays(table, done, [screen.metric])
     variables = {name: labelled(name, data) for name, data in arrays.items() if name != "case_id"}
-    data = SweepData(variables, {}, screen.spec, part, counted=screen.links)
-    value = metric_values(data, screen.entry)
+    value = metric_values(SweepData(variables, {}, screen.spec, part), screen.entry)
     columns = axis_columns(part)
     return tally_of(
         part.row, arrays["status"], np.asarray(value, float), columns, screen.axes, *screen.ranking

@@ -145,7 +145,8 @@ def best_sweep(screen: ScreenRequest, kept: CaseTable) -> str:
     """The kept designs as the file of a sweep, best first, whose cases have the same ids."""
     data = screen.spec.data
     written = {name: x for name, x in data["sweep"].items() if name not in _SPREADING}
-    sweep: dict[str, Any] = written | {"method": "list", "by": screen.by}
+    links = list(screen.spec.sweep.links)  # also where the designs kept control fewer
+    sweep: dict[str, Any] = written | {"method": "list", "by": screen.by, "links": links}
     sweep.pop("fidelity", None)
     sections = {name: x for name, x in data.items() if name != "sweep"}
     fields = {name: x for name, x in kept.fields.items() if name not in LABELS}

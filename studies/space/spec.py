@@ -75,6 +75,9 @@ class Sweep(Block):
         (), "-", f"further figures of every sampled loop to keep: {', '.join((*MARGINS, *PEAKS))}"
     )
     by: str = described("residual_rms", "-", "metric, or entry of one, that cases are ranked by")
+    links: tuple[int, ...] = described(
+        (), "1", "links that metrics are taken over, from 1; empty: those that any case controls"
+    )
     environments: tuple[str, ...] = described(
         (),
         "-",
@@ -137,6 +140,11 @@ def parse_sweep(data: dict[str, Any]) -> SweepSpec:
     ranking = parse_entries(sweep.by, "sweep.by").metric
     if "by" in data["sweep"] and sweep.metrics and ranking not in sweep.metrics:
         raise field_error("sweep.by", sweep.by, f"one of sweep.metrics = {list(sweep.metrics)}")
+    known = range(1, study.n_links + 1)
+    if not set(sweep.links) <= set(known) or len(set(sweep.links)) < len(sweep.links):
+        raise field_error(
+            "sweep.links", list(sweep.links), f"each of {', '.join(map(str, known))} once"
+        )
     for name in sweep.robustness:
         if name not in (*MARGINS, *PEAKS):
             hint = nearest(name, (*MARGINS, *PEAKS))
@@ -178,7 +186,7 @@ def _tuples(data: Any) -> Any:
     """Lists of blocks and cases as tuples; their contents are checked where they are used."""
     if not isinstance(data, dict):
         return data
-    listed = ("blocks", "cases", "environments", "metrics", "robustness")
+    listed = ("blocks", "cases", "environments", "links", "metrics", "robustness")
     return {k: tuple(v) if k in listed and isinstance(v, list) else v for k, v in data.items()}
 
 

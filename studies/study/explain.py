@@ -15,7 +15,13 @@ from studies.study.sizes import OneEach, depth
 
 _SIGNS = (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="))
 _WORDS = {bool: "true or false", str: "text", float: "a finite number", int: "a whole number"}
-_PLURALS = {bool: "values true or false", float: "finite numbers", str: "texts", dict: "tables"}
+_PLURALS = {
+    bool: "values true or false",
+    int: "whole numbers",
+    float: "finite numbers",
+    str: "texts",
+    dict: "tables",
+}
 
 #: Sections beyond those of a study; commands of the same name read them.
 COMMANDS = ("sweep", "tune", "fit")
