@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 import threading
 import warnings
@@ -69,6 +70,8 @@ INTERRUPTED = 130
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `studies` command."""
     keep_programs()
+    if threading.current_thread() is threading.main_thread():  # what batch systems end jobs with
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     if isinstance(sys.stdout, TextIOWrapper):  # what its encoding lacks is shown as an escape
         sys.stdout.reconfigure(errors="backslashreplace")
     try:

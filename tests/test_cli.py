@@ -11,8 +11,10 @@ import json
 import math
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,7 @@ import xarray
 from rich.table import Table
 
 import studies
+from studies import cli
 from studies.cli import app, console, main
 from studies.engine.modes import machine_modes
 from studies.study.files import READY
@@ -544,5 +547,26 @@ def test_workers_are_named_again_as_they_were():
     from studies.cluster.connect import TIMEOUT, Workers
 
     assert Workers(None, 2, TIMEOUT).options == " --local-workers 2"
-    assert Workers("tcp://a:1", None, 90.0).options == " --scheduler tcp://a:1 --worker-timeout 90"
+    remote = Workers("my file.json", None, 90.5)
+    assert remote.options == " --scheduler 'my file.json' --worker-timeout 90.5"
     assert Workers(None, None, 90.0).options == ""
+
+
+def test_sigterm_interrupts_as_ctrl_c_does(monkeypatch, capsys, tmp_path):
+    """What batch systems end a job with; the command that goes on is named where there is one."""
+    from studies.engine.folder import resumable
+
+    def ended(**_):
+        with resumable(tmp_path, "studies screen x.toml --resume"):
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(5)
+
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(cli, "app", ended)
+    try:
+        with pytest.raises(SystemExit) as error:
+            main([])
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert error.value.code == 130
+    assert "continue with: studies screen x.toml --resume" in capsys.readouterr().err

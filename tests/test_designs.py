@@ -17,6 +17,7 @@ from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import run_uncontrolled
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
+from studies.screen import report
 from studies.screen.report import margin_rows, quantile_rows, summary_lines, write_screen_report
 from studies.screen.run import LocalScreener, run_screen
 from studies.screen.shards import axis_columns, screen_of
@@ -222,7 +223,8 @@ def test_kept_designs_have_the_margins_of_the_sweep(whole, tmp_path):
     data = read_sweep(tmp_path / "sweep")
     margin = done.selection.margin
     np.testing.assert_allclose(margin, data["gain_margin"], rtol=1e-9)
-    assert f"of the best {KEEP} judged, {np.sum(margin < 1)} are unstable" in summary_lines(done)
+    judged = f"{KEEP} candidates judged, best first: {np.sum(margin < 1)} unstable"
+    assert judged in summary_lines(done)
 
 
 def test_designs_with_the_margin_asked_for_are_kept(whole, swept, tmp_path):
@@ -284,6 +286,51 @@ def test_links_that_a_machine_lacks_are_refused():
     for links in ([4], [0], [1, 1]):
         with pytest.raises(StudyError, match="sweep.links = .*allowed: each of 1, 2, 3 once"):
             small_spec(SWEEP | {"links": links})
+
+
+def test_designs_without_a_sampled_loop_need_no_margin(tmp_path):
+    """Nothing in them can go unstable; they are kept with the others, and counted."""
+    axes = {"control.feedback": ["none", "sampled"], "control.gain_factor": [0.5, 1.0]}
+    spec = small_spec({"method": "grid", "axes": axes})
+    done = screened(tmp_path, spec, margin=1.0)
+    fields = done.selection.kept.fields["control.feedback"].tolist()
+    assert sorted(fields) == ["none", "none", "sampled", "sampled"]
+    margin = done.selection.margin[done.selection.is_kept]
+    assert np.isnan(margin[np.array(fields) == "none"]).all()
+    assert "2 without a sampled loop" in " ".join(summary_lines(done))
+    write_screen_report(tmp_path, done)
+    text = text_of((tmp_path / "report.html").read_text())
+    assert "nan" not in text and "--subject-to" not in text and "| none |" in text
+    none = screened(tmp_path, spec, margin=60.0)
+    assert none.selection.kept.fields["control.feedback"].tolist() == ["none", "none"]
+
+
+def test_margins_below_one_have_no_negative_counts(whole, tmp_path):
+    shutil.copytree(whole[0], tmp_path / "out")
+    done = screened(tmp_path / "out", margin=0.5)
+    lines = " ".join(summary_lines(done))
+    assert "candidates judged, best first: " in lines and "more below that margin" not in lines
+
+
+def test_candidates_that_end_before_enough_are_found_are_told(whole, monkeypatch):
+    _, done = whole
+    monkeypatch.setattr(report, "CANDIDATES", len(done.tally.row))
+    few = done._replace(screen=done.screen._replace(margin=60.0, keep=1000))
+    for is_kept in (done.selection.is_kept, np.zeros(KEEP, bool)):
+        told = few._replace(selection=done.selection._replace(is_kept=is_kept))
+        assert "judges no more than its best" in " ".join(summary_lines(told))
+
+
+def test_what_tells_of_older_designs_goes_first(whole, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(whole[0], out)
+    (out / "report.html").write_text("of other designs")
+    screened(out, keep=3)
+    assert not (out / "report.html").exists()  # the command writes it anew
+    (out / BEST).unlink()
+    (out / BEST).mkdir()
+    with pytest.raises(StudyError, match="best.toml: cannot remove it"):
+        screened(out, margin=60.0)
 
 
 class Stopped(LocalScreener):
@@ -564,9 +611,14 @@ def test_report_says_what_was_found(whole):
     alone = run_uncontrolled(SPEC.study, is_linear=True).result.metrics.structural_rms[1, 1]
     assert done.uncontrolled == pytest.approx(float(alone), rel=1e-9)
     assert lines[-1].startswith("structural_rms[link=2][station=2] of the baseline without control")
-    worse = done._replace(uncontrolled=0.9 * done.tally.value[0])
-    assert summary_lines(worse)[-1].endswith("no design is below it")
-    assert "no design is below it" not in lines[-1]
+    value = done.selection.value
+    for free, told in (
+        (0.9 * value[0], "; no design that is kept is below it"),
+        (np.mean(value[[3, 4]]), f"; {KEEP - 4} kept are not below it"),
+        (1.1 * value[-1], ""),
+    ):
+        line = summary_lines(done._replace(uncontrolled=free))[-1]
+        assert line.partition(", by the linear model: ")[2].partition("µm")[2] == told
     assert {"values.png", "influence.png"} <= {path.name for path in out.iterdir()}
 
 

@@ -12,6 +12,7 @@ from contextlib import AbstractContextManager, contextmanager
 from ipaddress import ip_address
 from multiprocessing import resource_tracker
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeVar
 
 import typer
@@ -64,13 +65,11 @@ class Workers(NamedTuple):
     @property
     def options(self) -> str:
         """These as command-line options, "" for none."""
-        timeout = f"{self.timeout:g}" if self.are_named and self.timeout != TIMEOUT else None
-        named = {
-            "--scheduler": self.scheduler,
-            "--local-workers": self.local,
-            "--worker-timeout": timeout,
-        }
-        return "".join(f" {name} {value}" for name, value in named.items() if value is not None)
+        named: dict[str, object] = {"--scheduler": self.scheduler, "--local-workers": self.local}
+        if self.are_named and self.timeout != TIMEOUT:
+            named["--worker-timeout"] = self.timeout
+        written = ((name, quote(str(value))) for name, value in named.items() if value is not None)
+        return "".join(f" {name} {value}" for name, value in written)
 
     @property
     def are_named(self) -> bool:

@@ -291,14 +291,14 @@ def keep_request(file: Path, request: dict[str, Any], checked: Mapping[str, str]
 
 
 @contextmanager
-def resumable(out: Path) -> Iterator[None]:
-    """Say after Ctrl-C how work in a folder goes on."""
+def resumable(out: Path, command: str = "") -> Iterator[None]:
+    """Say after Ctrl-C how work in a folder goes on, by this command or the same one again."""
     try:
         yield
     except KeyboardInterrupt:
         if out.exists():
-            text = f"studies: finished work is safe; continue with --resume --out {quote(str(out))}"
-            print(text, file=sys.stderr)
+            how = command or f"--resume --out {quote(str(out))}"
+            print(f"studies: finished work is safe; continue with: {how}", file=sys.stderr)
         raise
 
 

@@ -79,29 +79,30 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.screen.run import PHASES, run_screen
         from studies.screen.shards import screen_of
         from studies.screen.stored import BEST
+        from studies.show.units import count_text
         from studies.space.spec import load_sweep
 
         asked = screen_of(load_sweep(spec), by, keep, margin, fidelity.value)
-
-        def make(client: Client) -> Screener:
-            from studies.screen.workers import ClusterScreener
-
-            return ClusterScreener(client, worker_timeout)
-
-        with resumable(out), Phases(console, PHASES, quiet) as phases:
-            with on_workers(workers, phases.say, make) as screener:
-                done = run_screen(asked, out, screener=screener, phases=phases)
-            if not done.is_interrupted:
-                phases.begin("report")
-                write_screen_report(out, done)
         asks = (
-            f"--by={quote(asked.by)} --keep {keep} --margin {margin:g} --fidelity {fidelity} "
+            f"--by={quote(asked.by)} --keep {keep} --margin {margin} --fidelity {fidelity} "
             f"--precision {precision}"
         )
         again = (
             f"studies {options()}screen {quote(str(spec))} --out {quote(str(out))} {asks} --resume"
             f"{workers.options}"
         )
+
+        def make(client: Client) -> Screener:
+            from studies.screen.workers import ClusterScreener
+
+            return ClusterScreener(client, worker_timeout)
+
+        with resumable(out, again), Phases(console, PHASES, quiet) as phases:
+            with on_workers(workers, phases.say, make) as screener:
+                done = run_screen(asked, out, screener=screener, phases=phases)
+            if not done.is_interrupted:
+                phases.begin("report")
+                write_screen_report(out, done)
         if done.is_interrupted:
             print(
                 f"studies: interrupted; {done.tally.n_designs:,} of {asked.n_designs:,} designs "
@@ -121,8 +122,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             announce(console, out / REPORT)
         if done.lost:
             print(
-                f"studies: {len(done.lost)} of {asked.n_shards} shards were left out, see above; "
-                f"retry them: {again}",
+                f"studies: of {count_text(asked.n_shards, 'shard')}, {len(done.lost)} left out, "
+                f"see above; retry: {again}",
                 file=sys.stderr,
             )
             sys.exit(1)

@@ -6,11 +6,16 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxmodel.metrics import METRICS
+from studies.engine.results import SweepData
 from studies.screen.run import ScreenOutcome
+from studies.screen.shards import ScreenRequest
 from studies.screen.tally import BUCKETS, GROWTH, LEAST, quantile
 from studies.show import figures
 from studies.show.units import headed, readable
+from studies.space.table import CaseTable
+from studies.store import Variable
 from studies.study.paths import field_unit
+from studies.sweeps.show import unit_of_metric
 
 #: Panels side by side.
 ACROSS = 3
@@ -22,10 +27,23 @@ FEW = 6
 WIDE = 20
 
 
+def described(screen: ScreenRequest, table: CaseTable) -> SweepData:
+    """What a screen ranks by, as a sweep without values tells of it."""
+    metric = METRICS[screen.metric]
+    variable = Variable(np.empty(0), ("case", *metric.dims), metric.unit, metric.text)
+    return SweepData({screen.metric: variable}, {}, screen.spec, table)
+
+
+def entry_unit(done: ScreenOutcome) -> str:
+    """Unit of what the designs are ranked by."""
+    assert done.selection is not None
+    return unit_of_metric(described(done.screen, done.selection.table), done.screen.entry)
+
+
 def values(done: ScreenOutcome) -> Figure:
     """Number of designs by value."""
     counts = done.tally.sketch[0]
-    unit = METRICS[done.screen.metric].unit
+    unit = entry_unit(done)
     factor = readable(unit)[0]
     seen = np.flatnonzero(counts)
     edges = factor * LEAST * GROWTH ** np.arange(BUCKETS + 1)
@@ -66,7 +84,7 @@ def axis_head(name: str) -> str:
 def influence(done: ScreenOutcome) -> Figure:
     """Quantiles of the metric over every axis."""
     screen = done.screen
-    unit = METRICS[screen.metric].unit
+    unit = entry_unit(done)
     factor = readable(unit)[0]
     is_largest = screen.ranking[1]
     count = len(screen.axes.names)

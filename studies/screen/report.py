@@ -11,11 +11,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxmodel import status
-from jaxmodel.metrics import METRICS
-from studies.engine.results import ROUNDING, SweepData
+from studies.engine.results import ROUNDING
 from studies.extensions import options
 from studies.publish import REPORT, publish
-from studies.screen.plots import axis_head, influence, values
+from studies.screen.plots import axis_head, described, entry_unit, influence, values
 from studies.screen.run import ScreenOutcome, all_failed
 from studies.screen.selection import Selection
 from studies.screen.shards import CANDIDATES, axis_columns
@@ -23,10 +22,9 @@ from studies.screen.stored import BEST
 from studies.screen.tally import LEFT_OUT, quantile
 from studies.show.figures import styled
 from studies.show.pages import page
-from studies.show.units import headed, readable
+from studies.show.units import count_text, headed, readable
 from studies.show.words import motion_text
-from studies.store import Variable
-from studies.study.margin import ENOUGH, margin_text
+from studies.study.margin import margin_text
 from studies.study.template import toml_text
 from studies.sweeps.plots import save_plot
 from studies.sweeps.show import counted_text
@@ -49,14 +47,9 @@ LEAST_INTERVALS = 5
 LEAST_MARGINS = (0, 1, 1.5, 2, 3, 4, 6, 10)
 
 
-def unit_of(done: ScreenOutcome) -> str:
-    """Unit of what the designs are ranked by."""
-    return METRICS[done.screen.metric].unit
-
-
 def quantity(done: ScreenOutcome, value: float) -> str:
     """A value of the metric with its unit, as people read it."""
-    factor, unit = readable(unit_of(done))
+    factor, unit = readable(entry_unit(done))
     return f"{factor * value:.4g}" + ("" if unit in ("", "1") else f" {unit}")
 
 
@@ -82,11 +75,17 @@ def quantile_rows(done: ScreenOutcome) -> list[tuple[str, str]]:
     rows = []
     for share in SHARES:
         if share * sketch.sum() >= 1:
-            value = quantile(sketch, 1 - share if is_largest else share)
-            best = done.tally.value[0]  # which a sketch's rounding may exceed
-            value = min(value, best) if is_largest else max(value, best)
-            rows.append((f"{100 * share:g} %", f"{quantity(done, value)} or {bound}"))
+            value = quantity(done, clipped_quantile(done, share))
+            rows.append((f"{100 * share:g} %", f"{value} or {bound}"))
     return rows
+
+
+def clipped_quantile(done: ScreenOutcome, share: float) -> float:
+    """A quantile counted from the best, which rounding in the sketch may not exceed."""
+    sketch, best = done.tally.sketch[0], float(done.tally.value[0])
+    if done.screen.ranking[1]:
+        return min(quantile(sketch, 1 - share), best)
+    return max(quantile(sketch, share), best)
 
 
 def summary_lines(done: ScreenOutcome) -> list[str]:
@@ -106,7 +105,7 @@ def summary_lines(done: ScreenOutcome) -> list[str]:
             return [*lines, "nothing is kept"]
         advice = all_failed(tally)
         return [*lines, "no design ended well; nothing is kept" + (advice and f": {advice}")]
-    half = quantity(done, quantile(tally.sketch[0], 0.5))
+    half = quantity(done, clipped_quantile(done, 0.5))
     half += " or less" if tally.value.min() < 0 else ""  # negative values count as 0
     lines += _selection_lines(done, done.selection, half)
     return lines + _edge_lines(done, done.selection) + _uncontrolled_line(done)
@@ -124,16 +123,22 @@ def _selection_lines(done: ScreenOutcome, selection: Selection, half: str) -> li
             f"{quantity(done, last)}; median of those that are ok: {half}"
         )
         first = int(np.argmax(selection.is_kept))
-        lines.append(f"case 0 of {BEST} has a gain margin of {margin_text(margin[first])}")
-        if abs(last - best) < ALIKE * abs(best):
+        lines.append(
+            f"case 0 of {BEST} has "
+            + ("no sampled loop" if np.isnan(margin[first]) else "a gain margin of ")
+            + ("" if np.isnan(margin[first]) else margin_text(margin[first]))
+        )
+        if done.n_kept > 1 and abs(last - best) <= ALIKE * abs(best):
             lines.append(
                 f"these differ by less than {100 * ALIKE:g} %: rank them by the full model, or by "
                 "another metric"
             )
-    n_unstable = int(np.sum(margin < 1))
-    passed = f"of the best {len(margin):,} judged, {n_unstable:,} are unstable"
-    if screen.margin:
-        passed += f" and {np.sum(margin < screen.margin) - n_unstable:,} more below that margin"
+    passed = f"{count_text(len(margin), 'candidate')} judged, best first: "
+    passed += f"{np.sum(margin < 1):,} unstable"
+    if screen.margin > 1:
+        passed += f", {np.sum((margin >= 1) & (margin < screen.margin)):,} more below that margin"
+    if n_without := int(np.sum(np.isnan(margin))):
+        passed += f", {n_without:,} without a sampled loop, and so without a margin"
     lines.append(passed)
     if not done.n_kept:
         largest = margin_text(np.nanmax(margin)) if np.isfinite(margin).any() else "none"
@@ -141,7 +146,7 @@ def _selection_lines(done: ScreenOutcome, selection: Selection, half: str) -> li
             f"none has a gain margin of at least {screen.margin:g} (largest: {largest}), and "
             "nothing is kept; ask for less with --resume --margin, or narrow the axes"
         )
-    elif done.n_kept < screen.keep and screen.margin and len(done.tally.row) >= CANDIDATES:
+    if done.n_kept < screen.keep and screen.margin and len(done.tally.row) >= CANDIDATES:
         lines.append(
             f"{done.n_kept:,} of {screen.keep:,} are kept, as a screen judges no more than its "
             f"best {CANDIDATES:,}"
@@ -167,12 +172,8 @@ def _edge_lines(done: ScreenOutcome, selection: Selection) -> list[str]:
 
 def _counted_text(done: ScreenOutcome) -> str:
     """What the metric is taken over, in words."""
-    metric, screen = METRICS[done.screen.metric], done.screen
     assert done.selection is not None
-    variable = Variable(np.empty(0), ("case", *metric.dims), metric.unit, metric.text)
-    table = done.selection.table
-    data = SweepData({screen.metric: variable}, {}, screen.spec, table)
-    return counted_text(data, screen.entry)
+    return counted_text(described(done.screen, done.selection.table), done.screen.entry)
 
 
 def margin_rows(done: ScreenOutcome) -> list[tuple[str, str, str]]:
@@ -192,16 +193,15 @@ def _uncontrolled_line(done: ScreenOutcome) -> list[str]:
     if done.uncontrolled is None:
         return []
     sign = -1 if done.screen.ranking[1] else 1
-    lead = sign * (done.uncontrolled - done.tally.value[0])
     model = "linear" if done.screen.spec.sweep.fidelity == "linear" else "full"
     text = f"{done.screen.entry} of the baseline without control, by the {model} model: "
     text += quantity(done, done.uncontrolled)
-    kept = done.selection.value[done.selection.is_kept] if done.selection else np.zeros(0)
-    n_worse = int(np.sum(sign * (kept - done.uncontrolled) > -ROUNDING * abs(done.uncontrolled)))
-    if n_worse and lead > ROUNDING * abs(done.uncontrolled):
-        text += f"; {n_worse:,} of the {len(kept):,} kept are no better"
-    if lead <= ROUNDING * abs(done.uncontrolled):
-        text += f"; no design is {'above' if sign < 0 else 'below'} it"
+    assert done.selection is not None
+    kept = done.selection.value[done.selection.is_kept]
+    n_worse = int(np.sum(sign * (done.uncontrolled - kept) <= ROUNDING * abs(done.uncontrolled)))
+    if n_worse:
+        which = "no design that is kept is" if n_worse == len(kept) else f"{n_worse:,} kept are not"
+        text += f"; {which} {'above' if sign < 0 else 'below'} it"
     return [text]
 
 
@@ -236,16 +236,10 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
             drawn=list(drawings),
             endings=ending_rows(done),
             quantiles=quantile_rows(done),
-            heads=(
-                "case",
-                "design",
-                headed(screen.entry, unit_of(done)),
-                "gain margin",
-                *(axis_head(name) for name in screen.axes.names),
-            ),
+            heads=_heads(done) if rows else (),
             rows=rows,
             n_kept=done.n_kept,
-            enough=ENOUGH,
+            condition=_condition(done),
             margins=margin_rows(done),
             motion=motion_text(screen.spec.study),
             window=screen.spec.study.metrics,
@@ -256,11 +250,23 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
         (staging / REPORT).write_text(text, encoding="utf-8")
 
 
+def _condition(done: ScreenOutcome) -> str:
+    """What `studies best` asks of designs like these, "" for nothing."""
+    if not done.screen.margin or done.selection is None or np.isnan(done.selection.margin).any():
+        return ""
+    return f"gain_margin >= {done.screen.margin}"
+
+
+def _heads(done: ScreenOutcome) -> tuple[str, ...]:
+    names = (axis_head(name) for name in done.screen.axes.names)
+    return ("case", "design", headed(done.screen.entry, entry_unit(done)), "gain margin", *names)
+
+
 def _best_rows(done: ScreenOutcome) -> list[tuple[str, ...]]:
     """The first cases that are kept; of all candidates, if none is."""
     selection = done.selection
     assert selection is not None
-    factor = readable(unit_of(done))[0]
+    factor = readable(entry_unit(done))[0]
     is_shown = selection.is_kept if done.n_kept else np.ones(len(selection.value), bool)
     shown = np.flatnonzero(is_shown)[:SHOWN]
     table = selection.table.rows(shown)

@@ -18,6 +18,7 @@ from studies.errors import StudyError
 from studies.screen.shards import ScreenRequest, designs_table
 from studies.screen.tally import Tally
 from studies.space.table import CaseTable
+from studies.study.fields import Fields
 
 #: Candidates judged at once.
 BLOCK = 2048
@@ -28,7 +29,7 @@ class Selection(NamedTuple):
 
     table: CaseTable  # their cases
     value: np.ndarray  # what they are ranked by, (n,)
-    margin: np.ndarray  # gain margins: factors on all gains [1], (n,)
+    margin: np.ndarray  # gain margins: factors on all gains [1]; NaN: no sampled loop, (n,)
     is_kept: np.ndarray  # which are cases of `best.toml`, (n,)
     n_left: int  # worse candidates that were not judged
 
@@ -61,13 +62,14 @@ def select(
     if not screen.margin:
         table, value = table.rows(np.arange(min(screen.keep, len(table)))), value[: screen.keep]
     margin = np.zeros(0)
-    is_kept = np.zeros(0, bool)
+    has_loop = Fields(table.study, table.fields).raw("control.feedback") == "sampled"
+    has_loop, is_kept = np.broadcast_to(has_loop, len(table)), np.zeros(0, bool)
     while len(margin) < len(table) and is_kept.sum() < screen.keep:
         if stop.is_set():
             return None
         rows = np.arange(len(margin), min(len(margin) + BLOCK, len(table)))
         margin = np.append(margin, _margins(screen, table.rows(rows)))
-        is_kept = (margin >= screen.margin) | (screen.margin == 0)  # then NaN is as good
+        is_kept = (margin >= screen.margin) | ~has_loop[: len(margin)] | (screen.margin == 0)
         on_block(len(margin), int(is_kept.sum()), len(table))
     judged = np.arange(len(margin))
     is_kept &= np.cumsum(is_kept) <= screen.keep

@@ -10,7 +10,7 @@ import numpy as np
 
 from studies.engine.folder import keep_request, make_manifest
 from studies.errors import StudyError
-from studies.publish import replacing
+from studies.publish import REPORT, replacing
 from studies.screen.shards import CANDIDATES, ScreenRequest
 from studies.screen.tally import BUCKETS, GROWTH, LEAST, N_ENDINGS, Tally, nothing
 from studies.space.axes import LABELS
@@ -158,9 +158,13 @@ def best_sweep(screen: ScreenRequest, kept: CaseTable) -> str:
 
 
 def write_best(folder: Path, screen: ScreenRequest, kept: CaseTable) -> None:
-    """Write `best.toml`, whole or not at all; remove an older one where nothing is kept."""
+    """Write `best.toml`, whole or not at all, and remove what tells of an older one."""
+    for stale in (REPORT, *([] if len(kept) else [BEST])):
+        try:
+            (folder / stale).unlink(missing_ok=True)
+        except OSError as error:
+            raise StudyError(f"{folder / stale}: cannot remove it ({error.strerror})") from None
     if not len(kept):
-        (folder / BEST).unlink(missing_ok=True)
         return
     with replacing(folder / BEST) as temporary:
         temporary.write_text(best_sweep(screen, kept), encoding="utf-8")

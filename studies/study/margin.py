@@ -56,7 +56,9 @@ def hysteresis_text(width: float) -> str:
 
 
 def margin_text(value: float, digits: int = 4) -> str:
-    """A gain margin in words; the search ends at `HIGHEST`."""
+    """A gain margin in words; the search ends at `HIGHEST`. NaN: there is no sampled loop."""
+    if math.isnan(value):
+        return "none"
     return f"> {HIGHEST:g}" if value >= HIGHEST else f"{value:.{digits}g}"
 
 
