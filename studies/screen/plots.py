@@ -12,7 +12,6 @@ from studies.screen.shards import ScreenRequest
 from studies.screen.tally import BUCKETS, GROWTH, LEAST, quantile
 from studies.show import figures
 from studies.show.units import headed, readable
-from studies.space.table import CaseTable
 from studies.store import Variable
 from studies.study.paths import field_unit
 from studies.sweeps.show import unit_of_metric
@@ -27,23 +26,22 @@ FEW = 6
 WIDE = 20
 
 
-def described(screen: ScreenRequest, table: CaseTable) -> SweepData:
+def described(screen: ScreenRequest) -> SweepData:
     """What a screen ranks by, as a sweep without values tells of it."""
     metric = METRICS[screen.metric]
     variable = Variable(np.empty(0), ("case", *metric.dims), metric.unit, metric.text)
-    return SweepData({screen.metric: variable}, {}, screen.spec, table)
+    return SweepData({screen.metric: variable}, {}, screen.spec)
 
 
-def entry_unit(done: ScreenOutcome) -> str:
+def entry_unit(screen: ScreenRequest) -> str:
     """Unit of what the designs are ranked by."""
-    assert done.selection is not None
-    return unit_of_metric(described(done.screen, done.selection.table), done.screen.entry)
+    return unit_of_metric(described(screen), screen.entry)
 
 
 def values(done: ScreenOutcome) -> Figure:
     """Number of designs by value."""
     counts = done.tally.sketch[0]
-    unit = entry_unit(done)
+    unit = entry_unit(done.screen)
     factor = readable(unit)[0]
     seen = np.flatnonzero(counts)
     edges = factor * LEAST * GROWTH ** np.arange(BUCKETS + 1)
@@ -71,8 +69,7 @@ def values(done: ScreenOutcome) -> Figure:
 
 
 def _last_kept(done: ScreenOutcome) -> float | None:
-    selection = done.selection
-    return float(selection.value[selection.is_kept][-1]) if selection and done.n_kept else None
+    return float(done.selection.kept_value[-1]) if done.selection and done.n_kept else None
 
 
 def axis_head(name: str) -> str:
@@ -84,7 +81,7 @@ def axis_head(name: str) -> str:
 def influence(done: ScreenOutcome) -> Figure:
     """Quantiles of the metric over every axis."""
     screen = done.screen
-    unit = entry_unit(done)
+    unit = entry_unit(screen)
     factor = readable(unit)[0]
     is_largest = screen.ranking[1]
     count = len(screen.axes.names)

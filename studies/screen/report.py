@@ -17,7 +17,7 @@ from studies.publish import REPORT, publish
 from studies.screen.plots import axis_head, described, entry_unit, influence, values
 from studies.screen.run import ScreenOutcome, all_failed
 from studies.screen.selection import Selection
-from studies.screen.shards import CANDIDATES, axis_columns
+from studies.screen.shards import CANDIDATES, ScreenRequest, axis_columns
 from studies.screen.stored import BEST
 from studies.screen.tally import LEFT_OUT, quantile
 from studies.show.figures import styled
@@ -49,7 +49,7 @@ LEAST_MARGINS = (0, 1, 1.5, 2, 3, 4, 6, 10)
 
 def quantity(done: ScreenOutcome, value: float) -> str:
     """A value of the metric with its unit, as people read it."""
-    factor, unit = readable(entry_unit(done))
+    factor, unit = readable(entry_unit(done.screen))
     return f"{factor * value:.4g}" + ("" if unit in ("", "1") else f" {unit}")
 
 
@@ -113,21 +113,18 @@ def summary_lines(done: ScreenOutcome) -> list[str]:
 
 def _selection_lines(done: ScreenOutcome, selection: Selection, half: str) -> list[str]:
     """Which designs are kept, what they are like, and what was passed over for them."""
-    screen, margin, value = done.screen, selection.margin, selection.value
+    screen, margin = done.screen, selection.margin
     lines = []
     if done.n_kept:
-        best, last = value[selection.is_kept][[0, -1]]
+        best, last = selection.kept_value[[0, -1]]
         which = f" with a gain margin of at least {screen.margin:g}" if screen.margin else ""
         lines.append(
             f"the best {done.n_kept:,}{which} by {screen.entry}: {quantity(done, best)} to "
             f"{quantity(done, last)}; median of those that are ok: {half}"
         )
-        first = int(np.argmax(selection.is_kept))
-        lines.append(
-            f"case 0 of {BEST} has "
-            + ("no sampled loop" if np.isnan(margin[first]) else "a gain margin of ")
-            + ("" if np.isnan(margin[first]) else margin_text(margin[first]))
-        )
+        first = margin[selection.is_kept][0]
+        what = "no sampled loop" if np.isnan(first) else f"a gain margin of {margin_text(first)}"
+        lines.append(f"case 0 of {BEST} has {what}")
         if done.n_kept > 1 and abs(last - best) <= ALIKE * abs(best):
             lines.append(
                 f"these differ by less than {100 * ALIKE:g} %: rank them by the full model, or by "
@@ -170,12 +167,6 @@ def _edge_lines(done: ScreenOutcome, selection: Selection) -> list[str]:
     return [f"most of these are at {' and '.join(ends)}: widen it if you can"] if ends else []
 
 
-def _counted_text(done: ScreenOutcome) -> str:
-    """What the metric is taken over, in words."""
-    assert done.selection is not None
-    return counted_text(described(done.screen, done.selection.table), done.screen.entry)
-
-
 def margin_rows(done: ScreenOutcome) -> list[tuple[str, str, str]]:
     """What more margin costs: margins, how many judged candidates have them, and the best one."""
     if done.selection is None:
@@ -193,11 +184,11 @@ def _uncontrolled_line(done: ScreenOutcome) -> list[str]:
     if done.uncontrolled is None:
         return []
     sign = -1 if done.screen.ranking[1] else 1
-    model = "linear" if done.screen.spec.sweep.fidelity == "linear" else "full"
+    model = done.screen.spec.sweep.fidelity
     text = f"{done.screen.entry} of the baseline without control, by the {model} model: "
     text += quantity(done, done.uncontrolled)
     assert done.selection is not None
-    kept = done.selection.value[done.selection.is_kept]
+    kept = done.selection.kept_value
     n_worse = int(np.sum(sign * (done.uncontrolled - kept) <= ROUNDING * abs(done.uncontrolled)))
     if n_worse:
         which = "no design that is kept is" if n_worse == len(kept) else f"{n_worse:,} kept are not"
@@ -236,14 +227,14 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
             drawn=list(drawings),
             endings=ending_rows(done),
             quantiles=quantile_rows(done),
-            heads=_heads(done) if rows else (),
+            heads=_heads(screen),
             rows=rows,
             n_kept=done.n_kept,
             condition=_condition(done),
             margins=margin_rows(done),
             motion=motion_text(screen.spec.study),
             window=screen.spec.study.metrics,
-            counted=_counted_text(done) if rows else "",
+            counted=counted_text(described(screen), screen.entry),
             is_compared=done.uncontrolled is not None,
             lost=done.lost,
         )
@@ -257,16 +248,16 @@ def _condition(done: ScreenOutcome) -> str:
     return f"gain_margin >= {done.screen.margin}"
 
 
-def _heads(done: ScreenOutcome) -> tuple[str, ...]:
-    names = (axis_head(name) for name in done.screen.axes.names)
-    return ("case", "design", headed(done.screen.entry, entry_unit(done)), "gain margin", *names)
+def _heads(screen: ScreenRequest) -> tuple[str, ...]:
+    names = (axis_head(name) for name in screen.axes.names)
+    return ("case", "design", headed(screen.entry, entry_unit(screen)), "gain margin", *names)
 
 
 def _best_rows(done: ScreenOutcome) -> list[tuple[str, ...]]:
     """The first cases that are kept; of all candidates, if none is."""
     selection = done.selection
     assert selection is not None
-    factor = readable(entry_unit(done))[0]
+    factor = readable(entry_unit(done.screen))[0]
     is_shown = selection.is_kept if done.n_kept else np.ones(len(selection.value), bool)
     shown = np.flatnonzero(is_shown)[:SHOWN]
     table = selection.table.rows(shown)

@@ -200,7 +200,6 @@ def _selected(
 ) -> Selection | None:
     phases.begin("margins", f"of {count_text(len(tally.row), 'candidate')}, best first")
     wanted = f", {{:,}} with a gain margin of at least {screen.margin:g}" if screen.margin else ""
-
     began = time.perf_counter()
 
     def tell(n_judged: int, n_kept: int, total: int) -> None:

@@ -31,12 +31,16 @@ class Selection(NamedTuple):
     value: np.ndarray  # what they are ranked by, (n,)
     margin: np.ndarray  # gain margins: factors on all gains [1]; NaN: no sampled loop, (n,)
     is_kept: np.ndarray  # which are cases of `best.toml`, (n,)
-    n_left: int  # worse candidates that were not judged
 
     @property
     def kept(self) -> CaseTable:
         """Cases of `best.toml`, best first."""
         return self.table.rows(np.flatnonzero(self.is_kept))
+
+    @property
+    def kept_value(self) -> np.ndarray:
+        """What they are ranked by."""
+        return self.value[self.is_kept]
 
 
 def select(
@@ -57,8 +61,7 @@ def select(
         Selection; None if it was stopped.
     """
     table = designs_table(screen, tally.row)
-    order = np.argsort(tally.row)
-    value = tally.value[order[np.searchsorted(tally.row, table.row, sorter=order)]]
+    value = tally.value[np.isin(tally.row, table.row)]  # without those left out as duplicates
     if not screen.margin:
         table, value = table.rows(np.arange(min(screen.keep, len(table)))), value[: screen.keep]
     margin = np.zeros(0)
@@ -78,7 +81,6 @@ def select(
         value=value[judged],
         margin=margin,
         is_kept=is_kept,
-        n_left=len(table) - len(margin),
     )
 
 
@@ -113,6 +115,5 @@ def uncontrolled(screen: ScreenRequest, kept: CaseTable) -> float | None:
         return None
     if run.status not in status.FINISHED:
         return None
-    baseline = metric_variables(run.result)
-    data = SweepData({}, {}, screen.spec, kept, baseline)
+    data = SweepData({}, {}, screen.spec, kept, metric_variables(run.result))
     return uncontrolled_value(data, screen.entry)
