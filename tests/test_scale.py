@@ -49,8 +49,8 @@ def test_shards_leave_nothing_behind(tmp_path):
     memory, handles, threads = (np.array(x) for x in zip(*watched.notes, strict=True))
     assert len(memory) == 24
     assert handles[12:].max() <= handles[6:12].max()
-    # those that end come and go; one that each shard kept would show as nine more
-    assert np.median(threads[12:]) <= np.median(threads[6:12])
+    # Pools that end take a moment, so counts vary upwards; what each shard keeps raises the lowest.
+    assert threads[12:].min() <= threads[6:12].min()
     assert memory[-1] - memory[11] < 8 * MIB
 
 
