@@ -41,6 +41,10 @@ COMPILER_FLAGS = {
     "--xla_cpu_prefer_vector_width": "512",
     # Fewer factorisations run side by side, see `POOL`.
     "--xla_cpu_enable_concurrency_optimized_scheduler": "false",
+    # None of the products and sums that XLA hands to the library YNNPACK. In large batches these
+    # gave wrong numbers without a word: jaxlib 0.10.2 products of small matrices summed over more
+    # than 16,384 rows (jax-ml/jax#39103), 0.11.2 NaN for pseudo-inverses of 1,536 matrices.
+    "--xla_cpu_experimental_ynn_fusion_type": "",
     "--xla_backend_extra_options": ",".join(
         (
             # Without it, each state output recomputes the expressions it shares with the others.
@@ -326,7 +330,8 @@ def _require_in_force(present: str, devices: int | None, flags: bool) -> None:
         raise StudyError(
             f"configure() came too late: JAX has already started without {', '.join(lacking)}; "
             "call it before the first JAX operation (in a notebook: restart the kernel), "
-            "or accept JAX as it is, several times slower, with configure(flags=False)"
+            "or accept JAX as it is with configure(flags=False): several times slower and, with "
+            "jaxlib 0.10.2 to 0.11, wrong in sums over large batches"
         )
 
 

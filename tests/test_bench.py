@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import jax
 import numpy as np
 import pytest
 
@@ -59,6 +60,20 @@ def test_gradient_figures(monkeypatch, capsys):
     found = json.loads(capsys.readouterr().out)
     assert set(KEYS.split()) <= set(found)
     assert found["parameters"] == 3 and found["configs_per_s"] > 0 < found["fingerprint"]
+
+
+def test_single_precision_is_measured_against_double(monkeypatch, capsys):
+    """Also where a thread of its own has no precision of its own, as the executor's."""
+    monkeypatch.setitem(WORKS["W0"], "link__modes", 1)
+    monkeypatch.setitem(WORKS["W0"], "control__modes", 1)
+    monkeypatch.setattr("studies.bench.works.REPEATS", 1)
+    try:
+        cli.main(["bench", "--work", "W0", "--batch", "16", "--precision", "float32", "--json"])
+    finally:
+        jax.config.update("jax_enable_x64", True)
+    found = json.loads(capsys.readouterr().out)
+    assert found["dtype"] == "float32"
+    assert 1e-9 < found["error"]["residual_rms"] < 1
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,10 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
+from jaxmodel.control import left_inverse
 from studies import config
 from studies.config import (
     COMPILER_FLAGS,
@@ -45,6 +47,22 @@ def run(code, **environment):
 def test_float64_and_flags_are_in_force():
     assert jnp.zeros(1).dtype == jnp.float64
     assert all(name in os.environ["XLA_FLAGS"] for name in (*COMPILER_FLAGS, DEVICE_FLAG))
+
+
+def test_sums_over_large_batches_are_right():
+    """Whole numbers, so exactly; half of them are wrong with jaxlib 0.10.2 without our flags."""
+    matrix = jnp.eye(3)
+    rows = np.zeros((2**15, 3))
+    rows[:, 0] = np.arange(len(rows))
+    squared = jax.jit(jax.vmap(lambda row: jnp.sum((matrix @ row) ** 2)))(rows)
+    np.testing.assert_array_equal(squared, rows[:, 0] ** 2)
+
+
+def test_pseudo_inverses_of_large_batches_are_right():
+    """NaN with jaxlib 0.11.2 without our flags."""
+    matrices = np.random.default_rng(0).normal(size=(512, 3, 3, 3))
+    found = jax.jit(jax.vmap(lambda x: left_inverse(x, np.ones(3))))(matrices)
+    np.testing.assert_allclose(found, np.linalg.pinv(matrices), rtol=1e-6, atol=1e-6)
 
 
 def test_garbage_is_looked_for_less_often_unless_the_user_has_a_say():
