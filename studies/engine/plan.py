@@ -189,7 +189,8 @@ def chunk_cases(table: CaseTable, rows: np.ndarray, structure: Structure, size: 
     """
     filled = np.concatenate([rows, np.full(size - len(rows), rows[-1])])
     columns = {name: column[filled] for name, column in table.fields.items()}
-    columns["run.seed"] = table.seed[filled]
+    if structure.has_noise:
+        columns["run.seed"] = table.seed[filled]
     return in_working_precision(build_cases(table.study, columns, structure))
 
 

@@ -96,11 +96,10 @@ def screen_arrays(spec: SweepSpec, table: CaseTable, done: Done) -> dict[str, np
     """
     assert spec.screen is not None
     arrays = chunk_arrays(table, done, [spec.screen.metric])
-    case_id = arrays.pop("case_id")
     variables = {name: labelled(name, data) for name, data in arrays.items()}
     value = metric_values(SweepData(variables, {}, spec, table), spec.screen.entry)
     return {
-        "case_id": case_id,
+        "case_id": table.case_id[done.chunk.rows],
         "screen_status": arrays["status"],
         "screen_value": np.asarray(value, float),
     }

@@ -71,7 +71,7 @@ def accurate() -> str:
 
 
 def chunk_arrays(table: CaseTable, done: Done, kept: list[str]) -> dict[str, np.ndarray]:
-    """Contents of a chunk's file: ids, status, metrics of its cases, without padding.
+    """Status, figures of the loop and metrics of a chunk's cases, without padding.
 
     Args:
         table: all cases.
@@ -97,7 +97,7 @@ def chunk_arrays(table: CaseTable, done: Done, kept: list[str]) -> dict[str, np.
     code[np.isin(code, status.FINISHED) & (margins["gain_margin"] < 1)] = status.UNSTABLE
     is_finished = np.isin(code, status.FINISHED)
     modes, controlled = (table.values(name)[rows] for name in ("link.modes", "control.modes"))
-    arrays = {"case_id": table.case_id[rows]}
+    arrays: dict[str, np.ndarray] = {}
     judged = {"status": code, "substeps": np.full(count, done.substeps), **margins}
     for name, (dims, *_) in PER_CASE.items():
         if name in ON_DEMAND and name not in judged:

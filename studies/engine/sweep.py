@@ -214,7 +214,7 @@ class _Run:
 
         def save(done: Done) -> np.ndarray:
             arrays = chunk_arrays(self.table, done, kept)
-            self.folder.write_chunk(arrays)
+            self.folder.write_chunk({"case_id": self.table.case_id[done.chunk.rows], **arrays})
             self.n_run += len(done.chunk.rows)
             return arrays["status"]
 

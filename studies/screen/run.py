@@ -18,11 +18,11 @@ from studies.engine.folder import locked_folder
 from studies.engine.progress import Phases, duration_text
 from studies.engine.sweep import interrupts
 from studies.screen.selection import Selection, select, uncontrolled
-from studies.screen.shards import ScreenRequest, shard_tally
+from studies.screen.shards import ScreenRequest, shard_tally, table_of
 from studies.screen.stored import begin, write_best, write_tally
 from studies.screen.tally import LEFT_OUT, Tally, merged
 from studies.show.units import count_text
-from studies.space.table import CaseTable, build_table
+from studies.space.table import CaseTable
 from studies.study.labels import remedy
 
 T = TypeVar("T")
@@ -82,7 +82,7 @@ class LocalScreener:
         screen = work.screen
 
         def make(shard: int) -> tuple[int, CaseTable]:
-            return shard, build_table(screen.spec, screen.rows(shard))
+            return shard, table_of(screen, shard)
 
         with ThreadPoolExecutor(1) as pool:
             for shard, table in _one_ahead(pool, make, work.shards):

@@ -174,6 +174,11 @@ def axis_columns(table: CaseTable) -> Columns:
     return found
 
 
+def table_of(screen: ScreenRequest, shard: int) -> CaseTable:
+    """Table of a shard's designs, those that repeat others included."""
+    return build_table(screen.spec, screen.rows(shard), is_distinct=False)
+
+
 def designs_table(screen: ScreenRequest, row: np.ndarray) -> CaseTable:
     """Table of some designs.
 
@@ -233,7 +238,7 @@ def shard_tally(
 
 def _chunk_tally(screen: ScreenRequest, table: CaseTable, done: Done) -> Tally:
     part, arrays = table.rows(done.chunk.rows), chunk_arrays(table, done, [screen.metric])
-    variables = {name: labelled(name, data) for name, data in arrays.items() if name != "case_id"}
+    variables = {name: labelled(name, data) for name, data in arrays.items()}
     value = metric_values(SweepData(variables, {}, screen.spec, part), screen.entry)
     columns = axis_columns(part)
     return tally_of(

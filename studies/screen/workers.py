@@ -14,10 +14,9 @@ from studies.cluster.runner import answers
 from studies.cluster.watch import Watch, wait_for_workers
 from studies.cluster.worker import identity, working
 from studies.screen.run import ShardWork
-from studies.screen.shards import ScreenRequest, screen_of, shard_tally
+from studies.screen.shards import ScreenRequest, screen_of, shard_tally, table_of
 from studies.screen.tally import Tally
 from studies.space.spec import parse_sweep
-from studies.space.table import build_table
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -90,7 +89,7 @@ def run_shard(job: ShardJob) -> ShardDone:
     """
     with working(job.identity, job.precision) as worker:
         screen = _screen(job.spec, job.by, job.fidelity, job.shard_size)
-        table = build_table(screen.spec, screen.rows(job.shard))
+        table = table_of(screen, job.shard)
         tally = shard_tally(screen, job.shard, table, threading.Event())
         assert tally is not None  # nothing stops it
         return ShardDone(tally, worker.address)

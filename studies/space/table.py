@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from hashlib import blake2b
 from itertools import product
 from typing import Any
@@ -43,14 +44,22 @@ class CaseTable:
     study: Study  # values of all fields without a column
     columns: Columns  # one row per case
     repeat: np.ndarray  # number of the repeat, (n,)
-    case_id: np.ndarray  # 16 hexadecimal digits as bytes, (n,)
-    seed: np.ndarray  # (n,)
     n_dropped: int  # cases excluded by `where`
     origin: np.ndarray  # for each row of the design, including duplicates, the number of its case
     row: np.ndarray  # number of its row in the design, from 0, (n,)
 
     def __len__(self) -> int:
         return len(self.repeat)
+
+    @cached_property
+    def case_id(self) -> np.ndarray:
+        """16 hexadecimal digits as bytes, (n,)."""
+        return case_ids(self.study, self.columns, self.repeat)
+
+    @cached_property
+    def seed(self) -> np.ndarray:
+        """Of noise and ripple, (n,)."""
+        return _seeds(self.study, self.columns, self.case_id)
 
     @property
     def n_double(self) -> int:
@@ -68,14 +77,15 @@ class CaseTable:
 
     def rows(self, chosen: np.ndarray) -> CaseTable:
         """Some of the cases."""
-        return replace(
+        part = replace(
             self,
             columns={name: column[chosen] for name, column in self.columns.items()},
             repeat=self.repeat[chosen],
-            case_id=self.case_id[chosen],
-            seed=self.seed[chosen],
             row=self.row[chosen],
         )
+        made = {name: vars(self)[name] for name in ("case_id", "seed") if name in vars(self)}
+        vars(part).update({name: column[chosen] for name, column in made.items()})
+        return part
 
 
 def environment_columns(names: Iterable[str], columns: Iterable[str]) -> set[str]:
@@ -122,12 +132,16 @@ def _codes(column: np.ndarray) -> np.ndarray:
     return np.unique(column, axis=axis, return_inverse=True)[1].ravel()
 
 
-def build_table(spec: SweepSpec, rows: np.ndarray | None = None) -> CaseTable:
+def build_table(
+    spec: SweepSpec, rows: np.ndarray | None = None, is_distinct: bool = True
+) -> CaseTable:
     """Expand a sweep into its cases.
 
     Args:
         spec: the sweep.
         rows: numbers of those rows of its design that are wanted, ascending, (n,); None: all.
+        is_distinct: leave out those that repeat the parameters of an earlier one. Finding them
+            takes longer than all else here.
 
     Raises:
         StudyError: a bad axis or condition, no case left, columns that do not fit one program.
@@ -167,14 +181,18 @@ def build_table(spec: SweepSpec, rows: np.ndarray | None = None) -> CaseTable:
     index = np.repeat(kept, repeats)
     columns = {name: column[index] for name, column in columns.items()}
     repeat = np.tile(np.arange(repeats), len(kept))
-    ids = case_ids(spec.study, columns, repeat)
-    _, first, which = np.unique(ids, return_index=True, return_inverse=True)
+    origin = np.arange(len(index))
+    table = CaseTable(spec.study, columns, repeat, n - len(kept), origin, rows[index])
+    return _without_doubles(table) if is_distinct else table
+
+
+def _without_doubles(table: CaseTable) -> CaseTable:
+    """The first of those cases that have equal parameters."""
+    _, first, which = np.unique(table.case_id, return_index=True, return_inverse=True)
     single = np.sort(first)
-    origin = np.searchsorted(single, first[which])
-    seeds = _seeds(spec.study, columns, ids)
-    dropped = n - len(kept)
-    table = CaseTable(spec.study, columns, repeat, ids, seeds, dropped, origin, rows[index])
-    return table if len(single) == len(ids) else table.rows(single)
+    if len(single) == len(table):
+        return table
+    return replace(table, origin=np.searchsorted(single, first[which])).rows(single)
 
 
 def values(study: Study, columns: Columns, name: str) -> np.ndarray:
