@@ -226,6 +226,22 @@ def test_bad_options_are_refused(capsys, tmp_path, cluster, monkeypatch):
 
 
 @pytest.mark.parametrize(
+    ("cores", "cases", "local", "is_said"),
+    [
+        (16, 10_000, None, True),
+        (16, 9_999, None, False),
+        (4, 10**6, None, False),
+        (16, 10**6, 8, False),
+    ],
+)
+def test_many_cores_are_told_of_workers(monkeypatch, cores, cases, local, is_said):
+    monkeypatch.setattr(connect, "usable_cores", lambda: cores)
+    lines = []
+    Workers(scheduler=None, local=local, timeout=600.0).advise(cases, lines.append)
+    assert len(lines) == is_said and all("--local-workers 8" in line for line in lines)
+
+
+@pytest.mark.parametrize(
     ("host", "is_said"), [("127.0.0.1", False), ("localhost", False), ("192.0.2.1", True)]
 )
 def test_a_scheduler_without_encryption_is_named(monkeypatch, host, is_said):

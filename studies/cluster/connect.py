@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeVar
 import typer
 
 from studies.cluster.watch import GONE, wait_for_workers
-from studies.config import usable_cores
+from studies.config import processor, usable_cores
 from studies.errors import StudyError, field_error
 from studies.reading import read_json
 
@@ -49,6 +49,11 @@ WorkerTimeout = Annotated[
 
 #: Default of `WorkerTimeout` [s].
 TIMEOUT = 600.0
+#: From so many cores on, processes with two of them each are faster than one process: in that,
+#: threads of XLA wait for each other (measured on 16, docs/performance.md).
+MANY = 8
+#: From so many cases on, that is worth their start, which takes 10 s.
+LARGE = 10_000
 #: Time limit for the scheduler to answer [s].
 PATIENCE = 15
 #: That for all workers to tell their versions, which computing does not delay [s].
@@ -75,6 +80,15 @@ class Workers(NamedTuple):
     def are_named(self) -> bool:
         """Whether workers are requested; otherwise this process does the work."""
         return self.scheduler is not None or self.local is not None
+
+    def advise(self, n_cases: int, say: Callable[[str], None]) -> None:
+        """Say it if so many cases would run faster on workers of this machine."""
+        cores = usable_cores()
+        if not self.are_named and cores >= MANY and n_cases >= LARGE and processor() == "cpu":
+            say(
+                f"one process uses about four of {cores} cores; "
+                f"--local-workers {cores // 2} is 2 to 4 times as fast"
+            )
 
 
 def runner_for(

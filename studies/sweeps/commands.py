@@ -77,6 +77,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         start(precision, gpu=not workers.are_named)
         from studies.engine.progress import Phases, duration_text
         from studies.engine.sweep import make_plan, run_sweep, sweep_phases
+        from studies.space.designs import design_of
         from studies.space.spec import load_sweep
         from studies.sweeps.dry_run import plan_document, print_plan
 
@@ -98,6 +99,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
         names = (*sweep_phases(sweep_spec), *(["report"] if report else []))
         with Phases(console, names, quiet) as phases:
+            design = design_of(sweep_spec.root, sweep_spec.study, sweep_spec.sweep.seed)
+            workers.advise(design.size, phases.say)
             with runner_for(sweep_spec, workers, phases.say) as runner:
                 done = run_sweep(sweep_spec, out, resume, runner=runner, phases=phases)
             if report and not done.is_interrupted:
