@@ -156,7 +156,7 @@ def table_of(examples):
     }
     n = len(rows)
     zero, row = np.zeros(n, int), np.arange(n)
-    return CaseTable(default, columns, zero, zero.astype("S16"), zero, 0, row, row)
+    return CaseTable(default, columns, zero, 0, row, row)
 
 
 @pytest.fixture(scope="module")
