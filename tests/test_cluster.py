@@ -226,18 +226,18 @@ def test_bad_options_are_refused(capsys, tmp_path, cluster, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("cores", "cases", "local", "is_said"),
+    ("cores", "is_large", "local", "is_said"),
     [
-        (16, 10_000, None, True),
-        (16, 9_999, None, False),
-        (4, 10**6, None, False),
-        (16, 10**6, 8, False),
+        (16, True, None, True),
+        (16, False, None, False),
+        (4, True, None, False),
+        (16, True, 8, False),
     ],
 )
-def test_many_cores_are_told_of_workers(monkeypatch, cores, cases, local, is_said):
+def test_many_cores_are_told_of_workers(monkeypatch, cores, is_large, local, is_said):
     monkeypatch.setattr(connect, "usable_cores", lambda: cores)
     lines = []
-    Workers(scheduler=None, local=local, timeout=600.0).advise(cases, lines.append)
+    Workers(scheduler=None, local=local, timeout=600.0).advise(is_large, lines.append)
     assert len(lines) == is_said and all("--local-workers 8" in line for line in lines)
 
 

@@ -221,11 +221,28 @@ def test_many_designs_side_by_side_are_as_few(tmp_path, monkeypatch):
     np.testing.assert_array_equal(many.tally.endings, few.tally.endings)
 
 
-def test_designs_that_repeat_others_are_counted_and_kept_once(tmp_path):
+def test_copies_of_good_designs_displace_no_others(tmp_path, monkeypatch):
+    monkeypatch.setattr(shards, "CANDIDATES", 50)
+    gains = np.linspace(0.3, 1.0, 8).tolist()
+    spec = small_spec(SWEEP | {"count": 512, "axes": {"gain": gains}})
+    done = screened(tmp_path / "screen", spec, shard_size=256, keep=8)
+    assert done.n_kept == 8
+    assert done.tally.endings[status.OK] <= 16  # a copy in each shard
+    assert done.tally.endings[LEFT_OUT] == 512 - done.tally.endings[:LEFT_OUT].sum()
+
+
+def test_a_shard_without_designs_is_counted(tmp_path):
+    done = screened(
+        tmp_path / "screen", small_spec(SWEEP | {"where": "gain < 0.13"}), shard_size=16
+    )
+    assert done.tally.n_designs == 200 > done.tally.endings[LEFT_OUT] > 150
+
+
+def test_designs_that_repeat_others_are_kept_once(tmp_path):
     cases = [{"control.gain_factor": gain} for gain in (0.5, 0.7, 0.5, 0.5)]
     spec = small_spec({"method": "list", "cases": cases, "by": SWEEP["by"]})
     done = screened(tmp_path / "screen", spec)
-    assert done.tally.endings[status.OK] == 4
+    assert done.tally.endings[status.OK] == 2
     kept = load_sweep(tmp_path / "screen" / BEST)
     assert sorted(build_table(kept).columns["control.gain_factor"]) == [0.5, 0.7]
     assert done.n_kept == 2

@@ -8,6 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from studies.engine.results import read_sweep
+from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.space.methods import morris_points, saltelli_points
 from studies.space.spec import load_sweep, parse_sweep
@@ -140,6 +142,27 @@ def test_id_and_seed_belong_to_the_case_not_to_the_sweep():
     reseeded = table_of({"axes": {"gain": [0.25, 0.5, 1.0]}}, run={"duration": 0.025, "seed": 1})
     assert not set(one.case_id.tolist()) & set(reseeded.case_id.tolist())
     assert len(np.unique(one.seed)) == 3
+
+
+@pytest.mark.parametrize(
+    ("sweep", "count"),
+    [({}, 1), ({"repeats": 3}, 3), ({"axes": {"run.duration": [0.025, 0.03]}}, 2)],
+)
+def test_cases_that_differ_in_no_number_run(sweep, count, tmp_path):
+    """They share every array, seeds included, as long as there is no noise."""
+    done = run_sweep(small_spec(sweep), tmp_path / "sweep", is_quiet=True)
+    assert done.n_run == count
+    rms = read_sweep(tmp_path / "sweep")["structural_rms"]
+    assert len(rms) == count and np.isfinite(rms).all()
+
+
+def test_doubles_are_found_by_columns_as_by_ids():
+    spec = small_spec({"method": "random", "count": 60, "axes": {"gain": [0.5, 0.7, 0.9]}})
+    by_id = build_table(spec, np.arange(60))
+    by_column = build_table(spec, np.arange(60), has_ids=False)
+    assert len(by_id) == 3 and by_id.n_double == 57
+    for name in ("row", "origin", "case_id", "seed"):
+        np.testing.assert_array_equal(getattr(by_id, name), getattr(by_column, name))
 
 
 def test_repeats_have_seeds_of_their_own_and_doubles_run_once():

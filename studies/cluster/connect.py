@@ -49,11 +49,9 @@ WorkerTimeout = Annotated[
 
 #: Default of `WorkerTimeout` [s].
 TIMEOUT = 600.0
-#: From so many cores on, processes with two of them each are faster than one process: in that,
-#: threads of XLA wait for each other (measured on 16, docs/performance.md).
-MANY = 8
-#: From so many cases on, that is worth their start, which takes 10 s.
-LARGE = 10_000
+#: On so many cores, processes with two of them each are faster than one process: in that, threads
+#: of XLA wait for each other (docs/performance.md).
+MANY = 16
 #: Time limit for the scheduler to answer [s].
 PATIENCE = 15
 #: That for all workers to tell their versions, which computing does not delay [s].
@@ -81,13 +79,13 @@ class Workers(NamedTuple):
         """Whether workers are requested; otherwise this process does the work."""
         return self.scheduler is not None or self.local is not None
 
-    def advise(self, n_cases: int, say: Callable[[str], None]) -> None:
-        """Say it if so many cases would run faster on workers of this machine."""
+    def advise(self, is_large: bool, say: Callable[[str], None]) -> None:
+        """Say it if much work, worth the 10 s of their start, would end sooner on local workers."""
         cores = usable_cores()
-        if not self.are_named and cores >= MANY and n_cases >= LARGE and processor() == "cpu":
+        if not self.are_named and cores >= MANY and is_large and processor() == "cpu":
             say(
-                f"one process uses about four of {cores} cores; "
-                f"--local-workers {cores // 2} is 2 to 4 times as fast"
+                f"one process uses about four of {cores} cores; --local-workers {cores // 2} "
+                "is faster (2 to 4 times on 16 cores)"
             )
 
 

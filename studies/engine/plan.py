@@ -189,8 +189,8 @@ def chunk_cases(table: CaseTable, rows: np.ndarray, structure: Structure, size: 
     """
     filled = np.concatenate([rows, np.full(size - len(rows), rows[-1])])
     columns = {name: column[filled] for name, column in table.fields.items()}
-    if structure.has_noise:
-        columns["run.seed"] = table.seed[filled]
+    # ids, and seeds from them, take as long as all else here
+    columns["run.seed"] = table.seed[filled] if structure.has_noise else np.zeros(size, np.int64)
     return in_working_precision(build_cases(table.study, columns, structure))
 
 

@@ -23,6 +23,9 @@ from studies.config import start
 from studies.publish import REPORT, announce
 from studies.study.margin import ENOUGH
 
+#: From so many designs on, workers of this machine are worth their start.
+LARGE = 10**6
+
 if TYPE_CHECKING:
     from distributed import Client
 
@@ -98,7 +101,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             return ClusterScreener(client, worker_timeout)
 
         with resumable(out, again), Phases(console, PHASES, quiet) as phases:
-            workers.advise(asked.n_designs, phases.say)
+            workers.advise(asked.n_designs >= LARGE, phases.say)
             with on_workers(workers, phases.say, make) as screener:
                 done = run_screen(asked, out, screener=screener, phases=phases)
             if not done.is_interrupted:

@@ -175,8 +175,8 @@ def axis_columns(table: CaseTable) -> Columns:
 
 
 def table_of(screen: ScreenRequest, shard: int) -> CaseTable:
-    """Table of a shard's designs, those that repeat others included."""
-    return build_table(screen.spec, screen.rows(shard), is_distinct=False)
+    """Table of a shard's designs, without those that repeat others."""
+    return build_table(screen.spec, screen.rows(shard), has_ids=False)
 
 
 def designs_table(screen: ScreenRequest, row: np.ndarray) -> CaseTable:

@@ -75,10 +75,11 @@ class CaseTable:
         """Values of a field, an entry or a label for every case, (n,); errors as `values`."""
         return np.broadcast_to(values(self.study, self.columns, name), (len(self),))
 
-    def rows(self, chosen: np.ndarray) -> CaseTable:
-        """Some of the cases."""
+    def rows(self, chosen: np.ndarray, origin: np.ndarray | None = None) -> CaseTable:
+        """Some of the cases; `origin`, if they stand for all."""
         part = replace(
             self,
+            origin=self.origin if origin is None else origin,
             columns={name: column[chosen] for name, column in self.columns.items()},
             repeat=self.repeat[chosen],
             row=self.row[chosen],
@@ -132,16 +133,15 @@ def _codes(column: np.ndarray) -> np.ndarray:
     return np.unique(column, axis=axis, return_inverse=True)[1].ravel()
 
 
-def build_table(
-    spec: SweepSpec, rows: np.ndarray | None = None, is_distinct: bool = True
-) -> CaseTable:
+def build_table(spec: SweepSpec, rows: np.ndarray | None = None, has_ids: bool = True) -> CaseTable:
     """Expand a sweep into its cases.
 
     Args:
         spec: the sweep.
         rows: numbers of those rows of its design that are wanted, ascending, (n,); None: all.
-        is_distinct: leave out those that repeat the parameters of an earlier one. Finding them
-            takes longer than all else here.
+        has_ids: cases that repeat the parameters of an earlier one are found by their ids, which
+            take longer than all else here; otherwise by their columns, and ids are made when they
+            are asked for.
 
     Raises:
         StudyError: a bad axis or condition, no case left, columns that do not fit one program.
@@ -183,16 +183,23 @@ def build_table(
     repeat = np.tile(np.arange(repeats), len(kept))
     origin = np.arange(len(index))
     table = CaseTable(spec.study, columns, repeat, n - len(kept), origin, rows[index])
-    return _without_doubles(table) if is_distinct else table
-
-
-def _without_doubles(table: CaseTable) -> CaseTable:
-    """The first of those cases that have equal parameters."""
-    _, first, which = np.unique(table.case_id, return_index=True, return_inverse=True)
+    keys = table.case_id if has_ids else _keys(table)
+    _, first, which = np.unique(keys, return_index=True, return_inverse=True)
     single = np.sort(first)
-    if len(single) == len(table):
-        return table
-    return replace(table, origin=np.searchsorted(single, first[which])).rows(single)
+    return (
+        table
+        if len(single) == len(table)
+        else table.rows(single, np.searchsorted(single, first[which]))
+    )
+
+
+def _keys(table: CaseTable) -> np.ndarray:
+    """Bytes that are equal for cases with equal columns, (n,)."""
+    columns = [table.repeat, *table.fields.values()]
+    numbers = [_codes(x) if x.dtype.kind not in "bif" else x for x in columns]
+    flat = [x.reshape(len(table), int(np.prod(x.shape[1:]))) for x in numbers]
+    whole = np.concatenate([np.ascontiguousarray(x).view(np.uint8) for x in flat], axis=1)
+    return whole.view(np.dtype((np.void, whole.shape[1]))).ravel()
 
 
 def values(study: Study, columns: Columns, name: str) -> np.ndarray:

@@ -36,6 +36,9 @@ Tolerance: TypeAlias = Annotated[
 ]
 Folder = Annotated[Path, typer.Argument(help="folder of a sweep")]
 
+#: From so many cases on, workers of this machine are worth their start.
+LARGE = 50_000
+
 
 def add_commands(app: typer.Typer, console: Console) -> None:
     """Add the commands of sweeps to the command line."""
@@ -100,7 +103,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         names = (*sweep_phases(sweep_spec), *(["report"] if report else []))
         with Phases(console, names, quiet) as phases:
             design = design_of(sweep_spec.root, sweep_spec.study, sweep_spec.sweep.seed)
-            workers.advise(design.size, phases.say)
+            workers.advise(design.size * sweep_spec.sweep.repeats >= LARGE, phases.say)
             with runner_for(sweep_spec, workers, phases.say) as runner:
                 done = run_sweep(sweep_spec, out, resume, runner=runner, phases=phases)
             if report and not done.is_interrupted:
