@@ -23,6 +23,7 @@ from studies.engine.stability import LoopFigures
 from studies.kernels.compilation import compiler_time
 from studies.space.table import CaseTable
 from studies.study.cases import signed_power
+from studies.study.fields import row_keys
 from studies.threads import COMPILING
 
 
@@ -247,10 +248,7 @@ def distinct_loops(cases: Case) -> tuple[np.ndarray, np.ndarray]:
     varying = [np.asarray(x) for x in jax.tree.leaves((*loops, cases.load)) if len(x) > 1]
     if not varying:
         return np.zeros(1, int), np.zeros(count, int)
-    rows = np.concatenate(
-        [np.ascontiguousarray(x.reshape(count, -1)).view(np.uint8) for x in varying if x.size],
-        axis=1,
-    )
-    _, first, own = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    keys = row_keys(x for x in varying if x.size)
+    _, first, own = np.unique(keys, return_index=True, return_inverse=True)
     order = np.argsort(first)
     return first[order], np.argsort(order)[np.ravel(own)]

@@ -23,13 +23,13 @@ from studies.config import start
 from studies.publish import REPORT, announce
 from studies.study.margin import ENOUGH
 
-#: From so many designs on, workers of this machine are worth their start.
-LARGE = 10**6
-
 if TYPE_CHECKING:
     from distributed import Client
 
     from studies.screen.run import Screener
+
+#: From so many designs on, workers of this machine are worth their start.
+LARGE = 10**6
 
 
 class Fidelity(StrEnum):

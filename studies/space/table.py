@@ -23,7 +23,7 @@ from studies.space.designs import design_of
 from studies.space.spec import SweepSpec
 from studies.study.consistency import SAMPLE_LIMIT
 from studies.study.entries import entry_sizes
-from studies.study.fields import Columns, Fields, padded
+from studies.study.fields import Columns, Fields, padded, row_keys
 from studies.study.paths import (
     Parts,
     as_list,
@@ -186,20 +186,15 @@ def build_table(spec: SweepSpec, rows: np.ndarray | None = None, has_ids: bool =
     keys = table.case_id if has_ids else _keys(table)
     _, first, which = np.unique(keys, return_index=True, return_inverse=True)
     single = np.sort(first)
-    return (
-        table
-        if len(single) == len(table)
-        else table.rows(single, np.searchsorted(single, first[which]))
-    )
+    if len(single) == len(table):
+        return table
+    return table.rows(single, np.searchsorted(single, first[which]))
 
 
 def _keys(table: CaseTable) -> np.ndarray:
     """Bytes that are equal for cases with equal columns, (n,)."""
     columns = [table.repeat, *table.fields.values()]
-    numbers = [_codes(x) if x.dtype.kind not in "bif" else x for x in columns]
-    flat = [x.reshape(len(table), int(np.prod(x.shape[1:]))) for x in numbers]
-    whole = np.concatenate([np.ascontiguousarray(x).view(np.uint8) for x in flat], axis=1)
-    return whole.view(np.dtype((np.void, whole.shape[1]))).ravel()
+    return row_keys(_codes(x) if x.dtype.kind not in "bif" else x for x in columns)
 
 
 def values(study: Study, columns: Columns, name: str) -> np.ndarray:

@@ -7,7 +7,7 @@ also be named after an entry of a list, `control.velocity_gain[0]`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,17 @@ def padded(values: list[Any], n_links: int) -> np.ndarray:
     array = np.full(shape, np.nan)
     _fill(array, values)
     return array
+
+
+def row_keys(columns: Iterable[np.ndarray]) -> np.ndarray:
+    """Bytes that are equal for rows whose numbers are equal in all columns, (n,).
+
+    Args:
+        columns: of numbers, one row each, (n, ...).
+    """
+    flat = [x.reshape(len(x), int(np.prod(x.shape[1:]))) for x in columns]
+    whole = np.concatenate([np.ascontiguousarray(x).view(np.uint8) for x in flat], axis=1)
+    return whole.view(np.dtype((np.void, whole.shape[1]))).ravel()
 
 
 def nesting(value: Any) -> int:
