@@ -148,5 +148,5 @@ def test_only_commands_keep_programs(tmp_path, monkeypatch):
     monkeypatch.setattr(compilation, "cache_folder", lambda: str(tmp_path))
     assert not programs.is_keeping()
     scaled(Structure(n_modes=5), np.ones(2), 1.0)
-    assert kept_data(["numbers"], lambda: 3) == 3
+    assert kept_data(["numbers"], lambda: 3, __name__) == 3
     assert not list(tmp_path.iterdir())

@@ -27,8 +27,9 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.loop import State, step
 from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import Outline, Result, Start, begin, conclude
+from studies import sources
 from studies.config import is_keeping, processor
-from studies.engine.programs import is_plain, kept_data, program, quick_options
+from studies.engine.programs import is_plain, kept_data, modules_of, program, quick_options
 from studies.errors import NoKernelError, warn_of_scan
 from studies.kernels import bridge, gpu, llvm, native
 from studies.kernels.differentiable import DifferentiableLoop
@@ -104,7 +105,9 @@ class BlockFunction:
         self._numbers, self._names = shared, _names(structure, build, kind, free, own, shared)
         first = [*jax.tree.map(lambda x: x[0], (free, own)), shared]
         self.parts: StartParts = kept_data(
-            self._names and ["parts", *self._names], lambda: _find_parts(self._begin, *first)
+            self._names and ["parts", *self._names],
+            lambda: _find_parts(self._begin, *first),
+            __name__,
         )
         self._programs: dict[str, Any] = {}
         self._compiling = Lock()
@@ -180,9 +183,10 @@ class BlockFunction:
 
     def _kernel(self) -> Callable[[list[Any]], list[Any]]:
         arguments = *self.loop_arguments(), _real(), self.structure.n_steps, self.lanes
-        name = (
-            sha256(repr(self._names).encode()).hexdigest() if self._names and is_keeping() else ""
-        )
+        name = ""
+        if self._names and is_keeping():
+            code = sources.digest(__name__, *modules_of(self._names))  # makes shared constants
+            name = sha256(repr((self._names, code)).encode()).hexdigest()
         return DifferentiableLoop(*arguments, bridge.CpuCall, name)
 
     def _gpu(self) -> Callable[[list[Any]], list[Any]]:
@@ -293,7 +297,8 @@ class BlockFunction:
         with self._compiling:
             if name not in self._programs:
                 if self._names and name not in _NOT_KEPT:
-                    self._programs[name] = program([name, *self._names], list(arguments), lower)
+                    names = [name, *self._names]
+                    self._programs[name] = program(names, list(arguments), lower, __name__)
                 else:
                     self._programs[name] = lower().compile()
             return self._programs[name]

@@ -2,9 +2,9 @@
 
 XLA's own cache saves compiling, but JAX must trace and lower a program before it can look there,
 which takes most of a warm start. A program here is found by its function, its static arguments, the
-shapes of the others, and everything else that it depends on: the code of the packages, versions,
-processor and flags. It is kept beside the kernels, under the user's key
-(`studies.kernels.compilation`).
+shapes of the others, and everything else that it depends on: the code of the function's module and
+of all that it imports (`sources.digest`), versions, processor and flags. It is kept beside the
+kernels, under the user's key (`studies.kernels.compilation`).
 
 Only commands without parts of the user's own keep programs (`config.keep_programs`): no name tells
 what a session of Python has changed by hand in a module, or what files a user's law has read.
@@ -16,9 +16,9 @@ import gc
 import os
 import pickle
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import fields, is_dataclass
 from functools import cache, cached_property, update_wrapper
-from hashlib import sha256
 from pathlib import Path
 from threading import Lock, RLock
 from typing import Any
@@ -106,7 +106,8 @@ class KeptFunction:
         return is_keeping() and all(map(is_plain, fixed))
 
     def _kept(self, fixed: list[Any], free: list[Any], arguments: tuple[Any, ...]) -> Any:
-        return program([self._name, *fixed], free, lambda: self._jit.lower(*arguments))
+        names = [self._name, *fixed]
+        return program(names, free, lambda: self._jit.lower(*arguments), self.__module__)
 
     def _split(self, arguments: tuple[Any, ...]) -> tuple[list[Any], list[Any]]:
         free = [x for k, x in enumerate(arguments) if k not in self._static]
@@ -148,13 +149,14 @@ def is_plain(x: Any) -> bool:
     return x is None or isinstance(x, bool | int | float | str)
 
 
-def program(names: list[Any], arguments: list[Any], lower: Callable[[], Any]) -> Any:
+def program(names: list[Any], arguments: list[Any], lower: Callable[[], Any], module: str) -> Any:
     """A compiled program: of this process, from disk, or compiled now and kept.
 
     Args:
         names: tell it from all others, by their `repr`.
         arguments: of its calls.
         lower: traces and lowers it.
+        module: has the code, itself or among its imports; but for that of functions in `names`.
 
     Returns:
         The program, a function of `arguments`.
@@ -167,7 +169,8 @@ def program(names: list[Any], arguments: list[Any], lower: Callable[[], Any]) ->
     with making:
         found = _PROGRAMS.get(name)
         if found is None:
-            found = _PROGRAMS[name] = _load_or_compile(name, lower)
+            modules = module, *modules_of(names)
+            found = _PROGRAMS[name] = _load_or_compile(name, lower, modules)
         return found
 
 
@@ -187,10 +190,10 @@ def _mappings() -> int:
         return 0
 
 
-def _load_or_compile(name: str, lower: Callable[[], Any]) -> Any:
+def _load_or_compile(name: str, lower: Callable[[], Any], modules: Iterable[str]) -> Any:
     if not is_keeping():
         return lower().compile()
-    entry = ObjectCache("program", name, *environment())
+    entry = ObjectCache("program", name, *environment(*modules))
     content = entry.take()
     loaded = None if content is None else _load(content)
     if loaded is not None:
@@ -205,14 +208,17 @@ def _load_or_compile(name: str, lower: Callable[[], Any]) -> Any:
     return compiled
 
 
-def kept_data(names: list[Any], make: Callable[[], Any]) -> Any:
+def kept_data(names: list[Any], make: Callable[[], Any], module: str) -> Any:
     """Data that can be pickled: from disk, or made now and kept.
 
     Args:
         names: everything they depend on but the code, by `repr`; none: they are not kept.
         make: makes them.
+        module: as for `program`.
     """
-    entry = ObjectCache("data", repr(names), *environment()) if names and is_keeping() else None
+    entry = None
+    if names and is_keeping():
+        entry = ObjectCache("data", repr(names), *environment(module, *modules_of(names)))
     content = entry and entry.take()
     if content:
         return pickle.loads(content)
@@ -222,10 +228,10 @@ def kept_data(names: list[Any], make: Callable[[], Any]) -> Any:
     return data
 
 
-def environment() -> tuple[str, ...]:
-    """All that programs depend on, whatever they compute."""
+def environment(*modules: str) -> tuple[str, ...]:
+    """All that programs of these modules depend on, whatever they compute."""
     return (
-        code_digest(),
+        sources.digest(__name__, *modules),
         jax.__version__,
         jaxlib.version.__version__,
         *native.this_processor(),
@@ -236,15 +242,15 @@ def environment() -> tuple[str, ...]:
     )
 
 
-@cache
-def code_digest() -> str:
-    """Hash of the code of the packages."""
-    digest = sha256()
-    for path in sorted(
-        x for package in sources.PACKAGES for x in (sources.TOP / package).rglob("*.py")
-    ):
-        digest.update(str(path).encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()
+def modules_of(names: Any) -> Iterator[str]:
+    """Modules of the functions that names hold."""
+    if callable(names):
+        yield names.__module__
+    if is_dataclass(names):
+        yield from modules_of([getattr(names, field.name) for field in fields(names)])
+    elif isinstance(names, list | tuple):
+        for name in names:
+            yield from modules_of(name)
 
 
 def _load(content: bytes) -> Any:
