@@ -8,7 +8,7 @@ BIN := .venv/bin
 PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 .DEFAULT_GOAL := help
-.PHONY: help install study explore docs notebooks test test-long smoke lint check clean venv
+.PHONY: help install study explore docs docs-tests notebooks test campaigns budget smoke lint check clean venv
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /make \1\t/p' Makefile | expand -t 16
@@ -27,29 +27,37 @@ explore: .venv/installed  ## coupling of the links, spillover of three designs, 
 	$(BIN)/studies atlas --out results/atlas
 	for design in paper paper_gains difference; do \
 	  $(BIN)/studies spillover $$design --out results/spillover-$$design; [ $$? -lt 2 ] || exit 2; done
-	$(PYTEST) -m "long or not long" tests/test_notebooks.py
+	$(PYTEST) -m "long or not long" docs/tests/test_notebooks.py
 
 notebooks: .venv/with-notebook  ## open the notebooks in JupyterLab
 	$(BIN)/jupyter lab --notebook-dir=notebooks
 
-docs: .venv/with-docs  ## build the site with the documentation, notebooks run, into docs/_build/html
+docs: .venv/with-docs docs-tests  ## test what documents say, and build the site, notebooks run, into docs/_build/html
 	$(BIN)/python -m sphinx -W --keep-going -n -q -j 2 -c docs . docs/_build/html
+
+docs-tests: .venv/installed  ## run the examples of documents, ready files and notebooks
+	$(PYTEST) docs/tests
 
 test: .venv/installed  ## run the tests
 	$(PYTEST)
 
-test-long: .venv/installed  ## run the long campaigns
+campaigns: .venv/installed  ## run the long campaigns: mutants, kills, fuzzing, scale, and all long tests
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[twin,robust]'
-	$(PYTEST) -m long
+	$(PYTEST) campaigns
+	$(PYTEST) -m long campaigns tests docs/tests
+
+budget: .venv/installed  ## measure what each file of tests may cost, and write tests/budget.tsv
+	$(BIN)/python -m tests.budget
 
 smoke: .venv/installed  ## run the wheel's main job on every supported Python here, core tests on the others
 	$(BIN)/python .ci/smoke.py
 
-lint: .venv/installed  ## lint, check format, types and the contract of imports
+lint: .venv/installed  ## lint, check format, types, the contract of imports, and what may not grow
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python .ci/limits.py
 
 check: lint test  ## all of it, as continuous integration does
 

@@ -44,7 +44,10 @@ PLACES = (
 #: Version of this interpreter, whose core tests `make test` runs.
 OWN = "{}.{}".format(*sys.version_info)
 #: Kernels, batches, the foreign function interface, tuning: the quick ones of their tests.
-FILES = ("equations", "kernel", "tangents", "batch", "batched", "tuning")
+FILES = (
+    *("kernels/test_equations", "kernels/test_kernel", "kernels/test_tangents"),
+    *("engine/test_batch", "engine/test_batched", "tuning/test_tuning"),
+)
 TESTS = (
     "test_equations and not gradients and not sweep",
     "translated",
@@ -152,7 +155,7 @@ class Smoke:
 
     def tests(self) -> str:
         """The core tests; returns the closing line."""
-        files = [f"tests/test_{name}.py" for name in FILES]
+        files = [f"tests/studies/{name}.py" for name in FILES]
         chosen = " or ".join(f"({name})" for name in TESTS)
         pytest = (self.bin / "python", "-m", "pytest", "-q", "-p", "no:cacheprovider")
         said = self.call(*pytest, *files, "-k", chosen, cwd=TOP)
@@ -170,6 +173,7 @@ class Smoke:
         """Run a command to its end or the time limit, outside the repository."""
         environment = {name: x for name, x in os.environ.items() if name != "PYTHONPATH"}
         environment |= {"XDG_CACHE_HOME": str(self.work / "cache"), "MPLBACKEND": "agg"}
+        environment["JAX_COMPILATION_CACHE_DIR"] = str(self.work / "cache" / "programs")
         return call(*command, until=self.until, cwd=cwd or self.work, env=environment, **options)
 
 

@@ -1,15 +1,15 @@
 """The documents, and the blocks of code in them."""
 
 import re
-from pathlib import Path
 
-ROOT = Path(__file__).parent.parent
+from tests import TOP
+
 #: README, and the pages of the site; what `make docs` builds is no source.
 PAGES = [
-    ROOT / "README.md",
-    *(path for path in sorted((ROOT / "docs").rglob("*.md")) if "_build" not in path.parts),
+    TOP / "README.md",
+    *(path for path in sorted((TOP / "docs").rglob("*.md")) if "_build" not in path.parts),
 ]
-NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+NOTEBOOKS = sorted((TOP / "notebooks").glob("*.ipynb"))
 
 
 def blocks(text, language):
@@ -19,4 +19,4 @@ def blocks(text, language):
 
 def page(name):
     """Text of a document, by its path from the root."""
-    return (ROOT / name).read_text(encoding="utf-8")
+    return (TOP / name).read_text(encoding="utf-8")

@@ -1,0 +1,1 @@
+"""Long campaigns and their tools: mutants, kills, fuzzing, scale; comparing two checkouts."""

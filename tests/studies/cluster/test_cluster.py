@@ -1,0 +1,353 @@
+"""Sweeps and tunings on a real scheduler and two real workers: the same numbers, whatever dies."""
+
+import os
+import signal
+import sys
+import threading
+import time
+from contextlib import ExitStack
+from itertools import islice
+from types import SimpleNamespace
+
+import dask
+import jax
+import numpy as np
+import pytest
+from distributed.comm.core import CommClosedError
+from rich.console import Console
+
+from studies.cluster import connect
+from studies.cluster.connect import Workers, connected
+from studies.cluster.runner import ClusterRunner
+from studies.cluster.worker import identity
+from studies.engine import plan
+from studies.engine.chunks import LocalRunner
+from studies.engine.columns import NOT_RUN
+from studies.engine.folder import CHUNKS, SweepFolder, finished_cases, read_manifest
+from studies.engine.results import read_sweep
+from studies.engine.sweep import run_sweep
+from studies.errors import StudyError
+from studies.screen.run import run_screen
+from studies.screen.shards import screen_of
+from studies.screen.workers import ClusterScreener
+from studies.tuning.run import make_evaluator
+from studies.tuning.workers import ClusterEvaluator
+from tests.clusters import machines
+from tests.studies.engine.test_sweeps import arrays, assert_same
+from tests.studies.test_cli import refused
+from tests.sweeps import MIXED, small_spec
+from tests.tunings import GAIN, tuning
+
+SPEC = small_spec(MIXED | {"blocks": [MIXED["blocks"][0] | {"count": 8}]})
+CASES = 144
+
+
+@pytest.fixture(autouse=True, scope="module")
+def small_chunks():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plan, "LANES", 8)
+        patch.setattr(plan, "LARGEST_CHUNK", 16)
+        yield
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    """A scheduler and two workers, and a client of them."""
+    with machines(tmp_path_factory.mktemp("cluster")) as found:
+        yield found
+
+
+@pytest.fixture(autouse=True)
+def two_workers_without_trouble(cluster):
+    cluster.trouble()
+    cluster.client.wait_for_workers(2, timeout=120)
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory):
+    """Folder of the same sweep run here."""
+    out = tmp_path_factory.mktemp("local") / "sweep"
+    run_sweep(SPEC, out, is_quiet=True)
+    return out
+
+
+def told(cluster, out, *more, timeout=60.0):
+    """Run the sweep on the cluster; the outcome and what was said."""
+    console = Console(record=True, width=200, file=open(os.devnull, "w"))  # noqa: SIM115
+    runner = ClusterRunner(cluster.client, SPEC, timeout)
+    outcome = run_sweep(SPEC, out, *more, console=console, runner=runner)
+    return outcome, console.export_text()
+
+
+def test_numbers_are_those_of_the_local_run(cluster, local, tmp_path):
+    outcome, text = told(cluster, tmp_path / "out")
+    assert outcome.n_run == CASES and len(outcome.lost) == 0
+    assert_same(arrays(local), arrays(tmp_path / "out"), 1e-12)
+    assert "workers: 2" in text and "144/144 cases" in text
+
+
+def test_a_screen_has_the_same_tally(cluster, tmp_path):
+    sweep = {"method": "random", "count": 200, "axes": {"gain": {"from": 0.1, "to": 1.0}}}
+    screen = screen_of(small_spec(sweep), keep=9, shard_size=64)
+    tallies = []
+    for name, screener in (("here", None), ("there", ClusterScreener(cluster.client, 60.0))):
+        done = run_screen(screen, tmp_path / name, is_quiet=True, screener=screener)
+        assert not done.lost and done.is_done.all()
+        tallies.append(done.tally)
+    here, there = tallies
+    np.testing.assert_array_equal(here.row, there.row)
+    np.testing.assert_array_equal(here.endings, there.endings)
+    np.testing.assert_allclose(here.value, there.value, rtol=1e-12)
+    assert here.n_designs == 200 and here.sketch[0].sum() == here.endings[0]
+
+
+@pytest.mark.long  # in short: numbers on workers are those of the local run, sweep after sweep
+def test_workers_do_not_mix_up_sweeps(cluster, tmp_path):
+    """Same shapes, another number that all cases share: it is written into the program."""
+    for kp in (2e4, 4e4):  # the first is that of the other tests: compiled already
+        spec = small_spec(drive={"kp": kp})
+        here, there = tmp_path / f"here{kp:g}", tmp_path / f"there{kp:g}"
+        run_sweep(spec, here, is_quiet=True)
+        runner = ClusterRunner(cluster.client, spec, 60.0)
+        run_sweep(spec, there, is_quiet=True, runner=runner)
+        assert_same(arrays(here), arrays(there), 1e-12)
+
+
+def test_from_here_to_the_cluster_and_back(cluster, local, tmp_path):
+    class Stopped(ClusterRunner):
+        def run(self, *arguments):
+            yield from islice(super().run(*arguments), 2)
+
+    out = tmp_path / "out"
+    run_sweep(small_spec(), out, is_quiet=True)  # half of the cases
+    with pytest.raises(StudyError, match="disappeared"):
+        run_sweep(SPEC, out, True, is_quiet=True, runner=Stopped(cluster.client, SPEC, 60.0))
+    assert len(list((out / CHUNKS).glob("*.h5"))) == 2
+    done = len(finished_cases(out).case_id)
+    assert CASES / 2 < done < CASES
+    again = run_sweep(SPEC, out, True, is_quiet=True)
+    assert again.n_run == CASES - done
+    assert_same(arrays(local), arrays(out), 1e-12)
+
+
+def test_a_full_disk_leaves_nothing_under_way(cluster, tmp_path, monkeypatch):
+    def write(*_):
+        raise StudyError("no space")
+
+    class Closed(ClusterRunner):
+        def run(self, *arguments):
+            try:
+                yield from super().run(*arguments)
+            finally:
+                closed.append(True)
+
+    closed = []
+    monkeypatch.setattr(SweepFolder, "write_chunk", write)
+    runner = Closed(cluster.client, SPEC, 60.0)
+    with pytest.raises(StudyError, match="no space") as raised:
+        run_sweep(SPEC, tmp_path / "out", is_quiet=True, runner=runner)
+    assert closed and raised.tb  # which keeps the frames: it is no matter of collecting garbage
+
+
+def test_a_chunk_that_fails_costs_no_worker(cluster, tmp_path):
+    cluster.trouble(fail=3)
+    before = cluster.pids()
+    outcome, text = told(cluster, tmp_path / "out")
+    assert outcome.n_run == CASES - 16 and "OSError: no room" in text
+    assert cluster.pids() == before
+
+
+def test_other_versions_are_refused(cluster, tmp_path):
+    cluster.trouble(identity={"jaxlib": "0.1", "code": "f00"})
+    with (
+        pytest.raises(StudyError, match="do not match this client: tcp://.*: code f00 .client: "),
+        connected(Workers(str(cluster.scheduler), None, 60.0), print),
+    ):
+        pass
+    with pytest.raises(StudyError, match=f"jaxlib 0.1 .client: {identity()['jaxlib']}"):
+        told(cluster, tmp_path / "late")  # a worker that came after the others were compared
+
+
+def test_a_worker_that_dies_when_asked_is_no_other_version():
+    answers = {"tcp://a": CommClosedError("in <TCP>: Stream is closed"), "tcp://b": identity()}
+    connect.refuse_other_versions(SimpleNamespace(run=lambda *_, **__: answers))
+    answers["tcp://c"] = OSError("no such file")
+    with pytest.raises(StudyError, match="do not match this client: tcp://c: no such file;"):
+        connect.refuse_other_versions(SimpleNamespace(run=lambda *_, **__: answers))
+
+
+def test_a_frozen_worker_does_not_hold_up_what_connects(cluster, monkeypatch):
+    monkeypatch.setattr(connect, "ANSWER_TIME", 2)
+    frozen = cluster.pids()[0]
+    os.kill(frozen, signal.SIGSTOP)
+    try:
+        with (
+            pytest.raises(StudyError, match="not told its versions within 2 s: restart workers"),
+            connected(Workers(str(cluster.scheduler), None, 60.0), print),
+        ):
+            pass
+    finally:
+        os.kill(frozen, signal.SIGCONT)
+
+
+def test_a_scheduler_that_goes_is_said(cluster):
+    """Wherever it is missed: here where the workers are counted."""
+    workers = Workers(str(cluster.scheduler), None, 60.0)
+    with pytest.raises(StudyError, match="the scheduler is gone"), connected(workers, print):
+        raise CommClosedError("ConnectionPool closing.")
+
+
+@pytest.mark.long
+def test_a_tuning_has_the_same_slopes(cluster):
+    spec = tuning(GAIN, starts=3)
+    here = make_evaluator(spec)
+    there = ClusterEvaluator(cluster.client, spec, 60.0, lambda text: None)
+    values = spec.free.values(np.array([[0.2], [0.5], [0.8]]))
+    wanted, found = here.evaluate(values), there.evaluate(values)
+    for name, x, y in zip(wanted._fields, wanted, found, strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-12, err_msg=name)
+    assert np.abs(found.slope).min() > 0
+
+
+def test_bad_options_are_refused(capsys, tmp_path, cluster, monkeypatch):
+    monkeypatch.setattr(connect, "PATIENCE", 2)
+    spec, out = "placement", tmp_path / "out"
+    sweep = ("sweep", spec, "--out", out)
+    both = ("--scheduler", "tcp://127.0.0.1:1", "--local-workers", 2)
+    assert "name one of them" in refused(capsys, *sweep, *both)
+    assert "no scheduler answers" in refused(capsys, *sweep, *both[:2])
+    assert "tcp://HOST:PORT" in refused(capsys, *sweep, "--scheduler", "nowhere.json")
+    assert "no client certificates" in refused(capsys, *sweep, "--scheduler", "tls://127.0.0.1:1")
+    assert "allowed: 1 to " in refused(capsys, *sweep, "--local-workers", 0)
+    scheduler = ("--scheduler", cluster.scheduler)
+    assert "--worker-timeout = 0.0" in refused(capsys, *sweep, *scheduler, "--worker-timeout", 0)
+    assert "plans for this process" in refused(capsys, *sweep, *scheduler, "--dry-run")
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("cores", "is_large", "local", "is_said"),
+    [
+        (16, True, None, True),
+        (16, False, None, False),
+        (4, True, None, False),
+        (16, True, 8, False),
+    ],
+)
+def test_many_cores_are_told_of_workers(monkeypatch, cores, is_large, local, is_said):
+    monkeypatch.setattr(connect, "usable_cores", lambda: cores)
+    lines = []
+    Workers(scheduler=None, local=local, timeout=600.0).advise(is_large, lines.append)
+    assert len(lines) == is_said and all("--local-workers 8" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("host", "is_said"), [("127.0.0.1", False), ("localhost", False), ("192.0.2.1", True)]
+)
+def test_a_scheduler_without_encryption_is_named(monkeypatch, host, is_said):
+    monkeypatch.setattr(connect, "PATIENCE", 0.1)
+    said = []
+    workers = Workers(f"tcp://{host}:1", None, 60.0)
+    with pytest.raises(StudyError, match="no scheduler answers"), connected(workers, said.append):
+        pass
+    assert bool(said) == is_said and all("not encrypted" in text for text in said)
+
+
+def test_a_scheduler_without_encryption_is_refused_where_it_is_required(cluster):
+    workers = Workers(str(cluster.scheduler), None, 60.0)
+    required = dask.config.set({"distributed.comm.require-encryption": True})
+    refused = pytest.raises(StudyError, match="no scheduler answers .*encryption")
+    with required, refused, connected(workers, print):
+        pass
+
+
+def test_without_dask_the_options_say_what_to_install(capsys, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    out = tmp_path / "out"
+    error = refused(capsys, "sweep", "placement", "--out", out, "--local-workers", "2")
+    assert error.startswith("studies: --local-workers: ") and not out.exists()
+    assert "install flexlink-studies[cluster]" in error
+
+
+@pytest.mark.long
+def test_a_worker_that_hangs_is_restarted(cluster, local, tmp_path):
+    told(cluster, tmp_path / "warm")  # compiling must not count as hanging
+    cluster.trouble(hang=100)
+    outcome, text = told(cluster, tmp_path / "out", timeout=4.0)
+    assert "has not answered for 4 s" in text and outcome.n_run == CASES
+    assert_same(arrays(local), arrays(tmp_path / "out"), 1e-12)
+
+
+def killing(cluster, out):
+    """A thread that kills a worker when the first chunk is there, and the worker's number."""
+    killed = []
+
+    def kill():
+        while not list((out / CHUNKS).glob("*.h5")):
+            time.sleep(0.01)
+            if (out / "results.h5").exists():
+                return
+        killed.append(cluster.pids()[0])
+        os.kill(killed[0], signal.SIGKILL)
+
+    thread = threading.Thread(target=kill, daemon=True)
+    thread.start()
+    return thread, killed
+
+
+def test_killed_workers_lose_nothing(cluster, local, tmp_path):
+    """Many kills: campaigns/test_kills.py."""
+    out = tmp_path / "out"
+    thread, killed = killing(cluster, out)
+    outcome, _ = told(cluster, out)
+    thread.join(timeout=60)
+    assert killed and outcome.n_run == CASES and len(outcome.lost) == 0
+    assert_same(arrays(local), arrays(out), 1e-12)
+
+
+@pytest.mark.long  # in short: a chunk that fails, and workers that are killed
+def test_a_chunk_that_kills_workers_is_left_out_until_resumed(cluster, local, tmp_path):
+    cluster.trouble(kill=70)
+    out = tmp_path / "out"
+    outcome, text = told(cluster, out)
+    assert 70 in outcome.lost and len(outcome.lost) == 16
+    assert outcome.n_run == CASES - 16 and not outcome.is_interrupted
+    (entry,) = read_manifest(out)["given_up"]
+    first, last = map(int, entry["cases"].split("-"))
+    assert first <= 70 <= last == first + 15 and "died" in entry["reason"]
+    assert f"cases {entry['cases']} are left out" in text
+    status = read_sweep(out)["status"]
+    np.testing.assert_array_equal(np.flatnonzero(status == NOT_RUN), outcome.lost)
+    cluster.trouble()
+    again = run_sweep(SPEC, out, True, is_quiet=True)  # here
+    assert again.n_run == 16 and "given_up" not in read_manifest(out)
+    assert_same(arrays(local), arrays(out), 1e-12)
+
+
+@pytest.mark.long
+def test_overhead_and_scaling(tmp_path, monkeypatch):
+    """Chunks of a second, programs compiled before; medians of four rounds, side by side."""
+    monkeypatch.setattr(plan, "LANES", 64)
+    monkeypatch.setattr(plan, "LARGEST_CHUNK", 1024)
+    gain = {"gain": {"from": 0.1, "to": 1.0, "count": 4096}}
+    spec = small_spec({"axes": gain}, run={"duration": 0.4})
+    cores = len(jax.local_devices())
+    with ExitStack() as stack:
+        found = {"here": LocalRunner()}
+        for name, workers, threads in (("whole", 1, cores), ("one", 1, 1), ("two", 2, 1)):
+            (tmp_path / name).mkdir()
+            options = {"workers": workers, "threads": threads, "is_small": False}
+            group = stack.enter_context(machines(tmp_path / name, **options))
+            found[name] = ClusterRunner(group.client, spec, 600.0)
+        times = {name: [] for name in found}
+        for k in range(5):
+            for name, runner in found.items():
+                out = tmp_path / f"{name}{k}"
+                done = run_sweep(spec, out, is_quiet=True, runner=runner)
+                assert done.n_run == 4096
+                times[name] += [done.run_time] * (k > 0)
+    here, whole, one, two = (float(np.median(x)) for x in times.values())
+    print(f"here {here:.2f} s, one worker with all cores {whole:.2f} s ({whole / here - 1:+.1%});")
+    print(f"one worker with one core {one:.2f} s, two {two:.2f} s ({one / two:.2f} times faster)")
+    assert whole / here < 1.1
+    assert one / two > 1.5

@@ -1,0 +1,422 @@
+"""Cards of papers: their contract, the list, and what each card finds, on small batches."""
+
+import json
+import re
+from functools import partial
+
+import jsonschema
+import numpy as np
+import pytest
+import scipy
+from rich.console import Console
+
+from jaxmodel.piezo import actuator_constant, sensor_constant
+from studies.papers.card import FAILS, HOLDS, depends_on, outcome_of
+from studies.papers.catalogue import CARDS
+from studies.papers.geronel_2025 import card as geronel_card
+from studies.papers.geronel_2025.comparison import (
+    SensorComparison,
+    matched_gain,
+    noise_limit,
+)
+from studies.papers.gupta_2010 import card as gupta_card
+from studies.papers.gupta_2010.closed_loop import MODES, ClosedLoops, close_loops
+from studies.papers.gupta_2010.criteria import (
+    LinkPlaces,
+    controllability,
+    least_effort,
+    least_spillover,
+    modal_force,
+    observability,
+)
+from studies.papers.gupta_2010.findings import PlaceGrid, rank
+from studies.papers.rrr_2016 import card as rrr_card
+from studies.papers.rrr_2016.claims import judge
+from studies.papers.rrr_2016.confirmation import confirm
+from studies.papers.rrr_2016.coupling import (
+    DEFINITIONS,
+    after_plucks,
+    coupling_ratio,
+    law,
+    ratio_of,
+)
+from studies.papers.rrr_2016.energies import (
+    ALL,
+    LINKS,
+    NONE,
+    PLUCKED,
+    SETTLED,
+    Energies,
+    free_energies,
+    propagator,
+)
+from studies.papers.rrr_2016.findings import Baseline, Effort, Kind, Sampled
+from studies.papers.rrr_2016.machines import baselines, sample, varied
+from studies.papers.rrr_2016.thresholds import DAMPING, greatest_damping, threshold
+from studies.papers.run import run_card
+from studies.show.document import schema
+from studies.study.cases import build_case
+from studies.study.spec import paper_study
+from tests.pages import text_of
+from tests.studies.test_cli import refused, run
+
+
+def test_cards_are_listed(capsys):
+    code, out, err = run(capsys, "paper")
+    assert (code, err) == (0, "")
+    assert [line.partition(":")[0] for line in out.splitlines()] == list(CARDS)
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (("zhang_2061", "--out", "OUT"), "NAME = 'zhang_2061'; allowed: .*did you mean 'zhang_201"),
+        (("rrr",), "NAME = 'rrr'; allowed: .*did you mean 'rrr_2016'?"),
+        (("zhang_2016",), "--out: missing"),
+        (("--out", "OUT"), "NAME: missing; allowed: zhang_2016"),
+    ],
+)
+def test_incomplete_requests_are_refused(capsys, arguments, message):
+    assert re.search(message, refused(capsys, "paper", *arguments))
+
+
+@pytest.mark.parametrize("card", CARDS.values(), ids=CARDS)
+def test_a_card_says_what_it_tests(card):
+    assert CARDS[card.name] is card and card.work > 0
+    assert card.claims and card.left_open and card.read
+    texts = [claim.text for claim in card.claims]
+    assert len({*texts}) == len(texts)
+    assert all(all(claim) for claim in card.claims)
+
+
+def test_outcomes():
+    assert [outcome_of(x) for x in (True, False)] == [HOLDS, FAILS]
+    assert depends_on("the mass", "holds below 1 kg") == "depends on the mass: holds below 1 kg"
+
+
+# --- rrr_2016 -------------------------------------------------------------------------------------
+
+SMALL = Effort(
+    machines=256,
+    poses=3,
+    modes=(1, 2),
+    drives=3,
+    masses=3,
+    strengths=(0.05,),
+    simulated=(),
+)
+
+
+@pytest.fixture(scope="module")
+def coupled(tmp_path_factory):
+    """Folder and result of the card on few machines."""
+    folder = tmp_path_factory.mktemp("rrr")
+    small = rrr_card.CARD._replace(run=partial(rrr_card.evaluate, SMALL))
+    return folder, run_card(small, folder, Console(quiet=True))
+
+
+def test_card_writes_a_whole_folder(coupled):
+    folder, result = coupled
+    data = [*(f"{name}.csv" for name in result.tables), "claims.json"]
+    images = [*(f"{name}.png" for name in result.figures), "machine.png"]
+    assert sorted(x.name for x in folder.iterdir()) == sorted([*data, *images, "report.html"])
+    found = json.loads((folder / "claims.json").read_text(encoding="utf-8"))
+    jsonschema.validate(found, schema("paper"))
+    assert [x["text"] for x in found["claims"]] == [x.text for x in rrr_card.CARD.claims]
+    assert "depends on the coupling ratio" in found["claims"][1]["outcome"]
+    text = text_of((folder / "report.html").read_text(encoding="utf-8"))
+    assert all(x["found"] in text for x in found["claims"])
+
+
+def test_a_whole_simulation_confirms_the_linear_plant():
+    """Sampled, nonlinear, with converters: its delay costs link 1 some damping."""
+    machines = varied(
+        baselines()["3-RRR"],
+        link_mass=np.array([20.0]),
+        platform_mass=np.array([0.2]),
+        near_mass=np.array([0.1]),
+        drive_ratio=np.array([0.4]),
+        damping=np.array([0.005]),
+        added=np.array([0.05]),
+        stiffness=np.array([[1.0, 1.01, 0.99]]),
+        poses=np.array([[0.01, 0.02, 0.1]]),
+    )
+    found = confirm(machines, 0, lambda *_: None)
+    assert found.linear_ratio > 0.3
+    assert found.simulated_ratio == pytest.approx(found.linear_ratio, rel=0.01)
+    np.testing.assert_allclose(found.simulated[1:], found.linear[1:], atol=0.01)
+    assert found.linear[1:].max() > 0.05
+    assert 0.8 * found.linear[0] < found.simulated[0] < found.linear[0]
+
+
+def test_one_mode_per_link_is_enough(coupled):
+    rows = np.array([row[1:] for row in coupled[1].tables["modes"].rows], float)
+    np.testing.assert_allclose(rows[::2, 1:], rows[1::2, 1:], rtol=0.01)
+
+
+@pytest.fixture(scope="module", params=["3-PRR", "3-RRR"])
+def free(request):
+    """A few machines of a sample, and their energies."""
+    machines = sample(baselines()[request.param], 32, seed=1)
+    return machines, free_energies(machines.study, machines.columns, machines.poses, 1)
+
+
+def test_energies_are_those_of_lyapunov_s_equation(free):
+    """SciPy's solver, case by case; the pluck of link 2 seen at link 1 and at the platform."""
+    _, energies = free
+    rows = np.flatnonzero(energies.is_feasible)
+    assert len(rows) > 16
+    for k in rows[:8]:
+        for mask in (NONE, ALL):
+            state = energies.state[k, mask]
+            start = np.eye(len(state))[7]
+            scale = scale_of(energies)  # for the solver
+            scaled = state * scale / scale[:, None]
+            for place, output in ((0, np.eye(1, len(state), 6)), (3, np.eye(2, len(state)))):
+                whole = scipy.linalg.solve_continuous_lyapunov(scaled.T, -output.T @ output)
+                value = energies.value[k, mask, place, 1]
+                np.testing.assert_allclose(value, start @ whole @ start, rtol=1e-6)
+
+
+def test_propagators_of_stiff_drives(free):
+    """SciPy's exponential, which does not limit its squarings."""
+    _, energies = free
+    size = np.abs(energies.state[:, NONE]).max(axis=(1, 2)) * energies.is_feasible
+    state = energies.state[int(np.argmax(size)), NONE]
+    scale = scale_of(energies)
+    found = (
+        np.asarray(propagator(state, SETTLED, 3, energies.omega.mean())) * scale / scale[:, None]
+    )
+    wanted = scipy.linalg.expm(SETTLED * state * scale / scale[:, None])
+    np.testing.assert_allclose(found, wanted, atol=1e-8 * np.abs(wanted).max())
+
+
+def scale_of(energies):
+    """Sizes of the states (X, X', q, q') of one mode per link."""
+    return np.repeat([1.0, energies.omega.mean(), 1.0, energies.omega.mean()], 3)
+
+
+def test_links_on_locked_drives_are_on_their_own():
+    """However light the platform: joints that stand still pass nothing on."""
+    study = baselines()["3-RRR"]
+    ratios = []
+    for drive_ratio in (1.5, 300.0):
+        machines = varied(
+            study,
+            link_mass=np.array([10.0]),
+            platform_mass=np.array([0.05]),
+            near_mass=np.array([0.1]),
+            drive_ratio=np.array([drive_ratio]),
+            damping=np.array([0.005]),
+            added=np.array([0.1]),
+            stiffness=np.ones((1, 3)),
+            poses=np.array([[0.01, 0.01, 0.05]]),
+        )
+        energies = free_energies(machines.study, machines.columns, machines.poses, 1)
+        ratios.append(float(coupling_ratio(energies)[0]))
+    assert ratios[1] < 1e-3 < 0.1 < ratios[0]
+
+
+def test_reductions_of_two_links_that_share_their_energy():
+    """The law by hand: energies 1 in the plucked link, rho^2 in another, control takes those."""
+    value = np.full((1, 5, 5, 6), 0.25)
+    value[0, NONE, LINKS, PLUCKED] = 0.25 + 0.75 * np.eye(3)
+    for i in range(3):  # with link i controlled nothing comes through it
+        value[0, 1 + i] = value[0, NONE]
+        value[0, 1 + i, :, i] = 0.0
+    energies = Energies(np.array([True]), value, np.zeros((1, 5, 1, 1)), np.ones((1, 3)))
+    assert coupling_ratio(energies)[0] == pytest.approx(0.5)
+    assert after_plucks(energies)[0] == pytest.approx(1 - np.sqrt(1.25 / 1.5))
+    assert law(0.5) == pytest.approx(1 - 1 / np.sqrt(1.25))
+    assert law(ratio_of(0.1)) == pytest.approx(0.1)
+
+
+def test_threshold_of_a_known_cloud():
+    """Reductions ratio +- 0.05, uniform: quantiles at 0.1 are crossed where ratio is 0.1 -+."""
+    rng = np.random.default_rng(3)
+    ratio = rng.uniform(0, 0.3, 4096)
+    found = threshold(ratio, ratio + rng.uniform(-0.05, 0.05, ratio.size), 0.1)
+    assert found.low == pytest.approx(0.055, abs=0.01)
+    assert found.middle == pytest.approx(0.1, abs=0.01)
+    assert found.high == pytest.approx(0.145, abs=0.01)
+    assert 0 < found.error < 0.01
+    never = threshold(ratio, 0 * ratio, 0.1)
+    assert np.isnan([never.low, never.middle, never.high]).all()
+
+
+def test_the_low_end_of_a_threshold_is_where_it_is_first_passed():
+    """A hump of high reductions at small ratios: no machines below the low end pass the level."""
+    ratio = np.linspace(0, 1, 4096)
+    reduction = np.where((ratio > 0.2) & (ratio < 0.4), 0.15, 0.05)
+    reduction = np.where(ratio > 0.7, 0.2, reduction)
+    found = threshold(ratio, reduction, 0.1)
+    assert found.low == pytest.approx(0.2, abs=0.03)
+    assert found.middle == pytest.approx(0.7, abs=0.03)
+
+
+def test_greatest_damping_of_a_known_function():
+    factor = np.array([1.0, 4.0, 1e-6, 1e6, np.nan])
+    found = greatest_damping(lambda zeta: 1e-3 * factor / zeta, 0.1, len(factor))
+    np.testing.assert_allclose(found[:2], [0.01, 0.04], rtol=0.01)
+    assert found[2] == 0 and found[3] == DAMPING[1] and np.isnan(found[4])
+
+
+def test_a_claim_without_exceptions_holds_or_fails(coupled):
+    """The outcome follows the numbers: no machine calmed, or all of them."""
+    kinds = {}
+    for name, study in baselines().items():
+        kinds[name] = kind_of(study, 0.0)
+    assert judge(kinds)[1].outcome == HOLDS and judge(kinds)[3].outcome == FAILS
+    for name, study in baselines().items():
+        kinds[name] = kind_of(study, 0.5)
+    assert judge(kinds)[1].outcome == FAILS and judge(kinds)[3].outcome == HOLDS
+
+
+def kind_of(study, reduction):
+    """A kind of which all machines have one reduction."""
+    ones = np.ones(4)
+    base = Baseline(
+        ratio=ones,
+        others=reduction * ones,
+        itself=ones,
+        every=ones,
+        platform=0.1 * np.ones((4, 2)),
+        converged=np.ones((1, 2)),
+    )
+    found = dict.fromkeys(DEFINITIONS, reduction * ones)
+    sampled = Sampled(machines=None, row=None, ratio=ones, reduction=found, thresholds={})
+    return Kind(study=study, baseline=base, sampled=sampled, strong=None, best=None, confirmed=[])
+
+
+# --- gupta_2010 -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def placed():
+    """Loops with a pair at a quarter, a third, the middle and three quarters of the links."""
+    places = np.array([0.05, 0.2 / 3, 0.1, 0.15])
+    return close_loops(paper_study(), places, np.array([0.02, 0.1, 0.2, 20.0]))
+
+
+def test_criteria_of_a_uniform_link_are_those_of_its_sines(placed):
+    """Slopes over a patch of length a: k cos(k (x + a/2)) - k cos(k (x - a/2)), k = j pi/L."""
+    link, place = placed.link, placed.place
+
+    def slopes(mode, length):
+        return np.abs(np.sin(mode * np.pi * place / 0.2) * np.sin(mode * np.pi * length / 0.4))
+
+    force = modal_force(link)
+    np.testing.assert_allclose(force / force[2], slopes(1, 0.03) / slopes(1, 0.03)[2], rtol=1e-6)
+    # mid-span is a node of mode 2, a third one of mode 3
+    for measure in (controllability, observability):
+        found = measure(link)
+        assert found[[1, 2]].max() < 1e-6 * found[0]
+    assert least_effort(link).argmax() == 2
+    # both slopes have a factor k, and frequencies grow as k^2
+    loop = [slopes(j, 0.03) * slopes(j, 0.01) for j in range(1, MODES + 1)]
+    wanted, found = loop[0] / sum(loop[1:]), least_spillover(link)
+    np.testing.assert_allclose(found / found[0], wanted / wanted[0], rtol=1e-6)
+
+
+def test_static_deflection_of_the_host_is_that_of_a_pair_of_moments(placed):
+    """A pair of moments M over a at mid-span bends it by M a (L - a/2)/(4 E I)."""
+    study = paper_study()
+    beam, patches = study.link, study.patches
+    machine = build_case(study).machine
+    moment = float(np.max(actuator_constant(machine.beam, machine.patches)))
+    stiffness = beam.youngs_modulus * beam.width * beam.thickness**3 / 12
+    a, length = patches.actuator_length, beam.length
+    wanted = moment * a * (length - a / 2) / (4 * stiffness)
+    assert abs(placed.link.bending[2]) == pytest.approx(wanted, rel=1e-6)
+
+
+def test_weak_control_damps_as_designed(placed):
+    """Energies fall as 1/zeta: 1.55 N s/m add 0.196, of which the least factor is 0.02."""
+    added = 0.02 * 1.55 / (2 * 0.0055 * placed.link.omega[2, 0])
+    assert placed.energy[2, 0] == pytest.approx(0.01 / (0.01 + added), rel=0.1)
+    assert np.isnan(placed.energy[:, -1]).all()
+
+
+def test_least_residual_keeps_the_margin():
+    """By hand: unstable from factor 4 on, so that 2 may be used and 3 may not."""
+    link = LinkPlaces(*(np.ones((1, 1)),) * 4, np.ones(1))
+    energy = np.array([[0.8, 0.5, 0.3, np.nan]])
+    loops = ClosedLoops(np.ones(1), np.array([1.0, 2.0, 4.0, 5.0]), energy, link)
+    assert loops.residual[0] == pytest.approx(np.sqrt(0.5))
+    never = loops._replace(energy=np.full((1, 4), np.nan))
+    assert never.residual[0] == 1.0
+
+
+def test_loss_and_rank_of_a_criterion():
+    loops = ClosedLoops(
+        place=np.array([0.1, 0.2, 0.3]),
+        factor=np.array([1.0, 2.0]),
+        energy=np.array([[0.36, 0.5], [0.25, 0.5], [0.49, 0.5]]),
+        link=None,
+    )
+    same = rank(np.array([2.0, 3.0, 1.0]), loops)
+    assert (same.place, same.loss, same.correlation) == (0.2, 0.0, pytest.approx(1.0))
+    other = rank(np.array([2.0, 1.0, 3.0]), loops)
+    assert other.loss == pytest.approx(0.7 / 0.5 - 1)
+    assert other.correlation == pytest.approx(-1.0)
+
+
+def test_placement_card_writes_a_whole_folder(tmp_path):
+    small = gupta_card.CARD._replace(
+        run=partial(gupta_card.evaluate, PlaceGrid(places=5, factors=4))
+    )
+    result = run_card(small, tmp_path, Console(quiet=True))
+    images = [*(f"{name}.png" for name in result.figures), "machine.png"]
+    data = [*(f"{name}.csv" for name in result.tables), "claims.json"]
+    assert sorted(x.name for x in tmp_path.iterdir()) == sorted([*data, *images, "report.html"])
+    assert {one.outcome for one in result.verdicts} <= {HOLDS, FAILS}
+
+
+# --- geronel_2025 ---------------------------------------------------------------------------------
+
+
+def test_gauges_give_the_voltage_of_piezo_sensors():
+    study = paper_study()
+    gauges = study.change(patches__sensor="strain_gauge", patches__gauge_gain=matched_gain(study))
+    piezo, gauge = (
+        np.asarray(sensor_constant(one.beam, one.patches))
+        for one in (build_case(study).machine, build_case(gauges).machine)
+    )
+    np.testing.assert_allclose(gauge, piezo, rtol=1e-9)
+
+
+def test_noise_limit_of_a_known_course():
+    """A ratio that grows with the logarithm of noise: 1.1 between 1 and 1.2 is half-way."""
+    noise = np.array([1e-7, 1e-6, 1e-5])
+    assert noise_limit(noise, np.array([1.0, 1.0, 1.2]), 1.1) == pytest.approx(10**-5.5)
+    assert np.isnan(noise_limit(noise, np.ones(3), 1.1))
+    assert np.isnan(noise_limit(noise, 2 * np.ones(3), 1.1))
+
+
+def test_sensor_card_writes_a_whole_folder_and_tells_what_decides(tmp_path):
+    small = geronel_card.CARD._replace(run=partial(geronel_card.evaluate, (1e-8, 1e-6, 3e-5), (0,)))
+    result = run_card(small, tmp_path, Console(quiet=True))
+    images = [*(f"{name}.png" for name in result.figures), "machine.png"]
+    data = [*(f"{name}.csv" for name in result.tables), "claims.json"]
+    assert sorted(x.name for x in tmp_path.iterdir()) == sorted([*data, *images, "report.html"])
+    assert result.verdicts[0].outcome == HOLDS
+    assert "gauges' amplifiers" in result.verdicts[1].outcome
+    limits = [float(row[4]) for row in result.tables["limits"].rows]
+    assert limits == sorted(limits, reverse=True)
+
+
+def test_equally_well_without_exceptions_holds_or_fails():
+    ones = np.ones((3, 2))
+    found = SensorComparison(
+        study=None,
+        frequency=np.array([80.0, 110.0, 160.0]),
+        gain=1.0,
+        noise=np.array([1e-7, 1e-6]),
+        free=10 * np.ones(3),
+        piezo=ones,
+        quiet=ones,
+        gauge=np.ones((3, 2, 2)),
+    )
+    assert [one.outcome for one in geronel_card.judge(found)] == [HOLDS, HOLDS]
+    loud = found._replace(gauge=9 * np.ones((3, 2, 2)))
+    assert [one.outcome for one in geronel_card.judge(loud)] == [FAILS, FAILS]

@@ -1,0 +1,280 @@
+"""The twin in Exudyn: its machine, its loop, and the command without the extra."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import jsonschema
+import numpy as np
+import pytest
+import scipy.integrate
+
+from studies.engine.design import Design
+from studies.engine.preflight import check_run
+from studies.errors import StudyError
+from studies.reference.tables import frequencies
+from studies.show.document import json_text, schema
+from studies.study.spec import Study
+from studies.twin import compare, report
+from studies.twin import run as twin_run
+from studies.twin.chain import close_chain
+from studies.twin.electronics import SensorFilter
+from studies.twin.machine import describe_machine
+from studies.twin.mesh import damping_matrix, held_modes, mesh_link
+from studies.twin.multibody import Settings, build_model
+from studies.twin.plan import SignalPath
+from studies.twin.ringing import ringing_poles
+from studies.twin.run import twin_design
+from tests.studies.test_cli import refused, run
+
+HOME = np.array([0.0, 0.0, np.pi / 6])
+
+
+def needs_exudyn() -> None:
+    pytest.importorskip("exudyn", reason="Exudyn is not installed: pip install '.[twin]'")
+
+
+def machine_of(**fields):
+    return describe_machine(*check_run(Study().change(**fields)))
+
+
+def test_mesh_has_nodes_at_patch_ends_and_modes_of_a_pinned_beam():
+    link = machine_of(patches__centers=(0.047, 0.101, 0.16)).links[0]
+    mesh = mesh_link(link, 40)
+    np.testing.assert_allclose(mesh.x[mesh.sensor_nodes], link.sensor_ends, atol=1e-12)
+    np.testing.assert_allclose(mesh.x[mesh.actuator_nodes], link.actuator_ends, atol=1e-12)
+    assert mesh.x[mesh.middle] == pytest.approx(0.1)
+    omega, _ = held_modes(mesh, (0.0, 0.0))
+    exact = (np.arange(1, 6) * np.pi / 0.2) ** 2 * np.sqrt(70e9 * 0.01 * 0.002**3 / 12 / 0.055)
+    np.testing.assert_allclose(omega[:5], exact, rtol=2e-5)
+
+
+def test_damping_holds_the_ratios_and_leaves_rigid_motion_alone():
+    link = machine_of(link__damping_ratio=(0.01, 0.02, 0.005)).links[0]
+    mesh = mesh_link(link, 20)
+    matrix = damping_matrix(mesh, link)
+    omega, shapes = held_modes(mesh, (0.0, 0.0))
+    modal = shapes.T @ matrix @ shapes
+    np.testing.assert_allclose(
+        np.diag(modal)[:4] / (2 * omega[:4]), [0.01, 0.02, 0.005, 0.005], rtol=1e-9
+    )
+    line = np.stack([0.3 + 2.0 * mesh.x, np.full_like(mesh.x, 2.0)], axis=1).ravel()
+    assert np.abs(matrix @ line).max() < 1e-12 * np.abs(matrix).max()
+
+
+def test_free_machine_has_the_frequencies_of_another_finite_element_model():
+    needs_exudyn()
+    machine = machine_of()
+    rho = close_chain(machine, HOME)[0]
+    model = build_model(
+        machine,
+        HOME,
+        lambda i, t, position, rate: 2e4 * (rho[i] - position),
+        Settings(n_elements=40, axial_factor=100.0),
+    )
+    expected = frequencies("sliders_on_springs_2e4_N_per_m")
+    square, _ = model.system.ComputeODE2Eigenvalues(computeComplexEigenvalues=False)
+    frequency = np.sqrt(np.sort(np.abs(square))[: len(expected)]) / (2 * np.pi)
+    np.testing.assert_allclose(frequency, expected, rtol=1e-5)
+
+
+SHORT = {
+    "run__duration": 0.1,
+    "motion__waypoints": ((0.0, 0.0, HOME[2]), (0.0, 0.01, HOME[2])),
+    "metrics__residual_delay": 0.0,
+    "metrics__residual_length": 0.04,
+}
+#: The links of our model do not stretch; steps of 25 us.
+STIFF = Settings(axial_factor=1000.0, n_steps=4)
+#: All that the twin supports beyond the default study.
+EVERYTHING = {
+    "link__basis": "loaded",
+    "control__basis": "loaded",
+    "link__length": (0.2, 0.21, 0.19),
+    "link__joint_inertia_c": 2e-6,
+    "link__damping_ratio": (0.01, 0.02),
+    "patches__centers": ((0.05, 0.1, 0.15), (0.055, 0.105, 0.15), (0.045, 0.095, 0.145)),
+    "shaper__kind": "zv",
+    "motion__move_time": 0.04,
+    "control__gain_factor": 0.3,
+    "electronics__amplifier_hz": 5000.0,
+    "electronics__sensor_highpass_hz": 2.0,
+    "electronics__adc_noise": 1e-4,
+    "drive__kind": "computed_torque",
+    "drive__coulomb_friction": 0.5,
+    "drive__friction_speed": 0.01,
+    "drive__viscous_friction": 3.0,
+    "drive__ripple": 0.5,
+    "drive__pulse_force": (5.0, 0.0, -3.0),
+    "drive__pulse_start": 0.0505,
+    "load__mass": 0.1,
+    "load__inertia": 5e-5,
+    "load__offset": (0.01, -0.02),
+    "load__wrench": (2.0, -1.0, 0.02),
+    "load__pulse": (0.0, 10.0, 0.0),
+    "load__pulse_start": 0.0552,
+}
+
+
+def differences(study, settings, machine=None):
+    """Of mid-span without and with control, and of voltages, all links together [1]."""
+    bench, ours = compare.TwinBench(study, settings), compare.our_runs(study)
+    bench.machine = bench.machine if machine is None else machine
+    pairs = [compare.pair(run, bench.run(k == 0)) for k, run in enumerate(ours)]
+    window = compare.in_window(bench.plan)
+    found = compare.cause("", pairs[1], pairs[0], window)
+    return np.array([found.free, found.controlled, found.voltage])
+
+
+def test_a_move_is_the_same_in_both_models_and_a_wrong_machine_is_noticed():
+    needs_exudyn()
+    study = Study().change(**SHORT)
+    found = differences(study, STIFF)
+    assert np.all(found < [2e-3, 1e-3, 4e-3]), found
+    machine = compare.TwinBench(study, STIFF).machine
+    softer = tuple(
+        link._replace(sections=link.sections._replace(bending=0.99 * link.sections.bending))
+        for link in machine.links
+    )
+    wrong = differences(study, STIFF, machine._replace(links=softer))
+    assert np.all(wrong > [1e-2, 4e-3, 4e-3]), wrong
+
+
+def test_everything_a_study_can_have_is_in_the_twin():
+    needs_exudyn()
+    found = differences(Study().change(**SHORT | EVERYTHING), STIFF)
+    assert np.all(found < 1e-2), found
+
+
+@pytest.mark.parametrize("highpass", [0.0, 300.0])
+def test_filters_are_stepped_exactly_where_signals_are_straight(highpass):
+    corner, step = 2 * np.pi * 2000.0, 2.5e-5
+    path = SignalPath(
+        period=1e-4,
+        antialias=corner,
+        highpass=highpass,
+        lag=0.0,
+        adc_gain=1.0,
+        adc_bias=0.0,
+        adc_step=1.0,
+        adc_top=1.0,
+        adc_noise=0.0,
+    )
+    grid = step * np.arange(41)
+    signal = np.interp(grid, [0.0, 5e-4, 1e-3], [1.0, 3.0, -2.0])
+
+    def rates(t, x):
+        u = np.interp(t, [0.0, 5e-4, 1e-3], [1.0, 3.0, -2.0])
+        s, z, rate = x
+        pull = corner**2 * (u - s - z) - np.sqrt(2.0) * corner * rate
+        return [highpass * (u - s), rate, pull]
+
+    start = [1.0, 0.0, 0.0] if highpass else [0.0, 1.0, 0.0]
+    exact = scipy.integrate.solve_ivp(
+        rates, (0, 1e-3), start, t_eval=grid, rtol=1e-10, atol=1e-12, max_step=step / 4
+    )
+    own = SensorFilter(path, step, (1,))
+    own.settle(signal[:1])
+    found = [own.present[0], *(own.advance(signal[k : k + 1])[0] for k in range(1, 41))]
+    np.testing.assert_allclose(found, exact.y[1], atol=1e-7)
+
+
+def test_ringing_tells_close_poles_apart():
+    poles = 2 * np.pi * np.array([-1.0 + 114j, -1.5 + 115j, -30 + 135j, 2.0 + 1199j])
+    shapes = np.random.default_rng(0).normal(size=(4, 9))
+    time = 1e-4 * np.arange(1200)
+    signals = (np.exp(np.outer(time, poles)) @ shapes).real
+    found = np.log(ringing_poles(signals, 300, 1e-8)) * 1e4
+    found = found[found.imag > 0]
+    np.testing.assert_allclose(np.sort_complex(found[:4]), np.sort_complex(poles), rtol=1e-5)
+    assert found[0] == pytest.approx(poles[3], rel=1e-6)  # what grows is left at the end
+
+
+def test_without_exudyn_one_sentence_says_what_to_install(capsys, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "exudyn", None)
+    message = refused(capsys, "twin", "paper", "--out", tmp_path / "out")
+    assert (
+        message.strip()
+        == "studies: studies twin: Exudyn is missing: install flexlink-studies[twin]"
+    )
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        ({"run__model": "ked"}, "run.model"),
+        ({"run__smooth": True}, "run.smooth"),
+        ({"link__basis": "pinned_free", "link__shortening": False}, "link.basis"),
+        ({"initial__modal": ((1e-6,), (), ())}, "initial.modal"),
+        ({"initial__load_deflection": (1e-6, 0.0, 0.0)}, "initial.load_deflection"),
+    ],
+)
+def test_what_the_twin_cannot_repeat_is_refused(fields, named):
+    with pytest.raises(StudyError, match=f"{named} = .*allowed: .*studies twin"):
+        compare.check_supported(Study().change(**fields))
+
+
+def test_a_run_that_ends_with_its_motion_is_refused():
+    study = Study().change(
+        run__duration=0.121, metrics__residual_delay=0.0, metrics__residual_length=5e-4
+    )
+    with pytest.raises(StudyError, match=r"run.duration = .*at least"):
+        compare.TwinBench(study, STIFF)
+
+
+def test_the_command_writes_report_figure_and_numbers(tmp_path, capsys, monkeypatch):
+    needs_exudyn()
+    design = Design(Study().change(**SHORT), {})
+    settings = STIFF._replace(n_elements=10, n_steps=8)
+    result = twin_design(design, tmp_path, settings=settings, has_changes=False)
+    document = json.loads((tmp_path / "twin.json").read_text())
+    jsonschema.validate(document, schema("twin"))
+    assert document == json.loads(json_text("twin", report.document(result)))
+    assert document["gain_margin"]["is_confirmed"]
+    assert document["gain_margin"]["theirs"] == pytest.approx(3.70, rel=0.01)
+    ours, theirs = (document["damping_ratio"][name] for name in ("ours", "theirs"))
+    np.testing.assert_allclose(theirs, ours, rtol=0.02)
+    page = (tmp_path / "report.html").read_text()
+    assert "mid-span deflection, link 1, with control" in page and "data:image/png" in page
+
+    monkeypatch.setattr(twin_run, "twin_design", lambda *_: result)
+    capsys.readouterr()
+    assert json.loads(run(capsys, "twin", "paper", "--json")[1]) == document
+    code, printed, _ = run(capsys, "twin", "paper")
+    assert code == 0 and document["verdict"] in printed and "gain margin" in printed
+
+
+#: A machine whose links have little in common.
+THREE = {
+    "control__gain_factor": 0.5,
+    "link__length": (0.2, 0.21, 0.19),
+    "link__thickness": (2e-3, 2.2e-3, 1.8e-3),
+    "patches__centers": ((0.05, 0.10, 0.15), (0.055, 0.105, 0.15), (0.045, 0.095, 0.145)),
+}
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize(
+    ("fields", "deflection", "voltage"),
+    [
+        # slower loops have signals so small that rounding of the ADC decides 0.6 % of them
+        ({"motion__move_time": 0.03}, 2.5e-3, 4e-3),
+        ({"motion__move_time": 0.05}, 2.5e-3, 1e-2),
+        ({"motion__move_time": 0.05, **THREE}, 3e-3, 1e-2),
+    ],
+)
+def test_the_square_is_the_same_in_both_models(fields, deflection, voltage, tmp_path):
+    needs_exudyn()
+    study = Study().change(run__duration=0.5, metrics__residual_length=0.1, **fields)
+    result = twin_design(Design(study, {}), tmp_path)
+    changes = {one.text: one for one in result.causes}
+    found = changes["as they are"]
+    assert found.controlled < deflection and found.voltage < voltage
+    # most of it is that links of our model do not stretch, or the ADC's rounding
+    assert changes["twin: links 1000 times stiffer in tension"].controlled < 1e-3
+    assert changes["both: an ADC that hardly rounds"].voltage < 4e-3
+    assert result.growth.is_confirmed
+    assert result.growth.margin == pytest.approx(float(result.loop.gain_margin), rel=1e-2)

@@ -1,0 +1,387 @@
+"""`studies verify`: its table, and that it can fail: deliberate faults in a copy of the code."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import jsonschema
+import numpy as np
+import pytest
+from rich.console import Console
+
+from studies import passport
+from studies.show.document import schema
+from studies.study.spec import load_study, paper_study, parse_study
+from studies.verify import commands, loops, run, stepping, trajectories
+from studies.verify.prepared import prepared
+from studies.verify.rows import Assumption, largest, worst, worst_relative
+from tests import TOP
+from tests.machines import random_machine
+from tests.studies.test_cli import run as call
+
+
+class Fault(NamedTuple):
+    """A change of one line, and the group of checks that must notice it."""
+
+    file: str
+    right: str
+    wrong: str
+    group: str
+
+
+FAULTS = {
+    "sign of a Coriolis term": Fault(
+        "jaxmodel/dynamics.py",
+        "load_g=2 * rate * (mass * jnp.sum(q * q_rate, axis=1))",
+        "load_g=-2 * rate * (mass * jnp.sum(q * q_rate, axis=1))",
+        "mechanics",
+    ),
+    "centrifugal force doubled": Fault(
+        "jaxmodel/dynamics.py",
+        "push = piezo + thrown * (chain.beta_rate * chain.beta_rate)[:, None]",
+        "push = piezo + 2 * thrown * (chain.beta_rate * chain.beta_rate)[:, None]",
+        "mechanics",
+    ),
+    "no shortening": Fault(
+        "jaxmodel/dynamics.py",
+        "shorter, rate = jnp.sum(row * q, axis=1) / 2, jnp.sum(row * q_rate, axis=1)",
+        "shorter, rate = 0 * jnp.sum(row * q, axis=1), 0 * jnp.sum(row * q_rate, axis=1)",
+        "mechanics",
+    ),
+    "wrong S": Fault(
+        "jaxmodel/beam.py",
+        "shortening=wave**2 * beam.length / 2,",
+        "shortening=wave**2 * beam.length / 4,",
+        "links and patches",
+    ),
+    "coupling b of even modes": Fault(
+        "jaxmodel/beam.py",
+        "b=line_mass * (1 + sign) / wave,",
+        "b=line_mass * (1 - sign) / wave,",
+        "links and patches",
+    ),
+    "distributed inertia": Fault(
+        "jaxmodel/dynamics.py",
+        "k_gg=link.k_gg - jnp.sum(spread.turning * q, axis=1),",
+        "k_gg=link.k_gg + jnp.sum(spread.turning * q, axis=1),",
+        "mechanics",
+    ),
+    "factor 2 in the actuators' constant": Fault(
+        "jaxmodel/piezo.py",
+        "return patches.width * patches.youngs_modulus * jnp.abs(patches.d31) * arm",
+        "return 2 * patches.width * patches.youngs_modulus * jnp.abs(patches.d31) * arm",
+        "links and patches",
+    ),
+    "free instead of clamped capacitance": Fault(
+        "jaxmodel/piezo.py",
+        "return permittivity * (1 - coupling) * area / patches.thickness",
+        "return permittivity * area / patches.thickness",
+        "links and patches",
+    ),
+    "a patch off by one": Fault(
+        "jaxmodel/prepare.py",
+        "sensor = lambda_s[:, None, None] * jnp.swapaxes(basis.sensor_slope, 1, 2)",
+        "sensor = jnp.roll(lambda_s[:, None, None] * jnp.swapaxes(basis.sensor_slope, 1, 2), 1, 1)",
+        "links and patches",
+    ),
+    "static correction with the wrong sign": Fault(
+        "jaxmodel/prepare.py",
+        "return lambda_s * lambda_a * static_remainder(basis, mode_mask).slope",
+        "return -lambda_s * lambda_a * static_remainder(basis, mode_mask).slope",
+        "links and patches",
+    ),
+    "amplitude of a shaper": Fault(
+        "jaxmodel/shaper.py",
+        "outer = (1 + tolerance) / 4",
+        "outer = (1 - tolerance) / 4",
+        "trajectories",
+    ),
+    "instants of a shaper": Fault(
+        "jaxmodel/shaper.py",
+        "decay = jnp.pi * zeta / jnp.sqrt(1 - jnp.square(zeta))",
+        "decay = jnp.pi * zeta / jnp.sqrt(1 + jnp.square(zeta)) / 2",
+        "trajectories",
+    ),
+    "acceleration of the reference trajectory": Fault(
+        "jaxmodel/motion.py",
+        "return u - sine / (2 * np.pi), 1 - jnp.cos(angle), 2 * np.pi * sine",
+        "return u - sine / (2 * np.pi), 1 - jnp.cos(angle), np.pi * sine",
+        "trajectories",
+    ),
+    "a design for a delay of two samples": Fault(
+        "jaxmodel/electronics.py",
+        "late = hold * jnp.exp(-1.5j * omega * period)",
+        "late = hold * jnp.exp(-2.5j * omega * period)",
+        "figures of others",
+    ),
+    "runs without a delay": Fault(
+        "jaxmodel/loop.py",
+        "        clipped = jnp.max(jnp.max(info.is_clipped, axis=1), axis=0)\n",
+        "        clipped, voltage = jnp.max(info.is_clipped), after.voltage\n",
+        "digital loop",
+    ),
+    "swapped links": Fault(
+        "jaxmodel/controller.py",
+        "after, demand = controller.feedback.step(state.feedback, measured - own)",
+        "after, demand = controller.feedback.step(state.feedback, (measured - own)[::-1])",
+        "figures of others",
+    ),
+    "half the structural damping": Fault(
+        "jaxmodel/plant.py",
+        "damping=2\n",
+        "damping=1\n",
+        "mechanics",
+    ),
+    "a stage of the time step": Fault(
+        "jaxmodel/loop.py",
+        "c = stage(a, x, slope3, h, 2 * n3 - n1)",
+        "c = stage(a, x, slope3, h, 2 * n3 - n2)",
+        "time steps",
+    ),
+    "payload without its offset": Fault(
+        "jaxmodel/plant.py",
+        "inertia = inertia + payload * jnp.sum(jnp.asarray(offset) ** 2)",
+        "inertia = inertia + 0 * payload * jnp.sum(jnp.asarray(offset) ** 2)",
+        "mechanics",
+    ),
+    "operands of a difference in machine code": Fault(
+        "studies/kernels/graph.py",
+        'self._node("sub", a, b)',
+        'self._node("sub", b, a)',
+        "time steps",
+    ),
+    "residual vibration without its root": Fault(
+        "jaxmodel/metrics.py",
+        "return _root(_average(totals, total, count))",
+        "return _average(totals, total, count)",
+        "time steps",
+    ),
+}
+
+#: Faults tried in the quick tests.
+QUICK = ("wrong S", "amplitude of a shaper")
+_CHECK = """
+import json, sys
+from studies.config import start
+start()
+from studies.study.spec import parse_study
+from studies.verify.run import CHECKS
+machine = {"load": {"mass": 0.1, "inertia": 1e-4, "offset": [0.02, 0.01]}}
+names = [name for name in CHECKS if name.startswith(sys.argv[1])]
+rows = [row for name in names for row in CHECKS[name](parse_study(machine))]
+print(json.dumps([row.assumption for row in rows if not row.is_passed]))
+"""
+
+
+def failed_rows(folder: Path, group: str, limit: float) -> list[str]:
+    """Assumptions that fail in a group of checks of the code in a folder."""
+    done = subprocess.run(
+        [sys.executable, "-c", _CHECK, group],
+        cwd=folder,
+        env={"PYTHONPATH": str(folder), "PATH": "/usr/bin:/bin", "OPENBLAS_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=limit,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def copied(folder: Path, fault: Fault | None) -> Path:
+    for name in ("jaxmodel", "studies"):
+        shutil.copytree(TOP / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+    if fault is not None:
+        path = folder / fault.file
+        text = path.read_text()
+        assert text.count(fault.right) == 1
+        path.write_text(text.replace(fault.right, fault.wrong))
+    return folder
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(x, marks=() if x in QUICK else pytest.mark.long) for x in FAULTS],
+)
+def test_a_fault_makes_a_row_fail(name, tmp_path):
+    fault = FAULTS[name]
+    failed = failed_rows(copied(tmp_path, fault), fault.group, 400)
+    assert failed
+
+
+@pytest.mark.long
+def test_the_copy_without_a_fault_passes(tmp_path):
+    assert failed_rows(copied(tmp_path, None), "", 600) == []
+
+
+REST = {"motion": {"waypoints": [[0.0, 0.0, 0.52]]}}
+SMALL = {"link": {"modes": 1}, "control": {"modes": 1}, "patches": {"centers": [0.1]}}
+
+
+@pytest.mark.parametrize("points", [1, 2])
+def test_steps_of_a_machine_at_rest(points):
+    motion = {"waypoints": REST["motion"]["waypoints"] * points}
+    error, order = stepping._steps(parse_study(SMALL | {"motion": motion}))
+    assert error.outcome == "passed" and 0 < error.difference < 1e-6
+    assert order.left_out == "the step is exact to rounding"
+
+
+def test_steps_say_why_their_order_is_left_out():
+    heavy = {"load": {"wrench": [1.0, 0.0, 0.0]}}
+    assert "friction" not in stepping._steps(parse_study(SMALL | heavy))[1].left_out
+
+
+@pytest.mark.parametrize("points", [1, 2])
+def test_machine_code_at_rest(points):
+    motion = {"waypoints": REST["motion"]["waypoints"] * points}
+    row = stepping._kernel(parse_study(SMALL | {"motion": motion}))
+    assert row.outcome == "passed" and row.allowed == 1e-8
+
+
+def test_an_unstable_loop_has_no_linear_run():
+    study = parse_study(SMALL)
+    assert loops._release(study).outcome == "passed"
+    assert "unstable" in loops._release(study.change(control__gain_factor=1e3)).left_out
+
+
+@pytest.mark.parametrize(
+    ("kind", "hertz"), [("zv", [458.0]), ("ei3", [1030.0]), ("zv", [90, 1030])]
+)
+def test_shapers_of_fast_modes(kind, hertz):
+    study = parse_study({"shaper": {"kind": kind, "frequencies_hz": list(map(float, hertz))}})
+    _, case, found = prepared(study)
+    assert trajectories._taps(study, case, found.taps).outcome == "passed"
+    detuned = study.change(shaper__frequencies_hz=[2 * x for x in hertz])
+    assert trajectories._taps(detuned, case, found.taps).outcome == "FAILED"
+
+
+@pytest.mark.parametrize("command", ["'", "/bin/false", "no_such_compiler"])
+def test_a_bad_compiler_costs_one_row(command, monkeypatch):
+    monkeypatch.setenv("CC", command)
+    row = loops._exported(parse_study(SMALL))
+    assert row.assumption == "exported C controller"
+    assert row.outcome == ("FAILED" if command == "/bin/false" else "left out")
+
+
+CHEAP = ("links and patches", "trajectories and shapers", "mechanics")
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_random_machines_pass(seed):
+    shaper = {"kind": "ei_damped", "frequencies_hz": [100.0, 410.0], "split": "exact"}
+    basis = {"basis": ("pinned_pinned", "loaded")[seed % 2]}
+    study = random_machine(seed, link=basis, shaper=shaper)
+    rows = [row for name in CHEAP for row in run.CHECKS[name](study)]
+    assert len(rows) == 12 and all(row.is_passed for row in rows), rows
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "sections",
+    [
+        {"link": {"basis": "pinned_free"}},
+        {"link": {"basis": "loaded", "joint_inertia_c": 1.1e-5}, "control": {"law": "lqg"}},
+        {"control": {"feedback": "ideal"}, "run": {"duration": 0.7}},
+        {"drive": {"coulomb_friction": 1.0}, "control": {"law": "ppf"}},
+        REST | {"drive": {"locked": True}, "initial": {"modal": [[1e-4], [], []]}},
+    ],
+    ids=["pinned_free", "loaded", "ideal", "friction", "locked"],
+)
+def test_other_studies_pass(sections):
+    found = run.verify_study(parse_study(sections))
+    assert found.is_passed, [row for row in found.rows if not row.is_passed]
+
+
+# --- table, documents, exit code ------------------------------------------------------------------
+
+
+def row(difference, allowed=1e-3, **more):
+    return Assumption(
+        assumption="x", against="y", source="Z 1990", difference=difference, allowed=allowed, **more
+    )
+
+
+def test_what_passes():
+    assert row(1e-4).is_passed and row(1e-3).is_passed and not row(2e-3).is_passed
+    assert not row(np.nan).is_passed and not row(np.inf).is_passed
+    assert row(np.nan, left_out="nothing there").outcome == "left out"
+    assert [row(0.0).outcome, row(1.0).outcome] == ["passed", "FAILED"]
+    assert largest([1.0, 2.0], [1.0, 4.0]) == 0.5 and worst_relative([1.0, 2.0], [1.0, 4.0]) == 0.5
+    assert largest([np.nan], [1.0]) == np.inf and worst_relative([np.nan], [1.0]) == np.inf
+    assert largest([1e-3], [0.0]) == 1e-3
+    # the built-in max passes over a NaN that is not first
+    assert worst(0.0, np.nan) == worst(np.nan, 0.0) == worst([0.0, np.nan]) == np.inf
+    assert worst(0.5, [0.1, 2.0]) == 2.0
+
+
+@pytest.fixture
+def checks(monkeypatch, tmp_path):
+    """Checks of the command: what is put into the dictionary, instead of all."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
+    chosen = {"one": lambda _: [row(1e-4), row(0.0, left_out="nothing there")]}
+    monkeypatch.setattr(run, "CHECKS", chosen)
+    return chosen
+
+
+def test_the_command(checks, capsys, tmp_path):
+    code, out, _ = call(capsys, "verify")
+    assert code == 0 and "1 of 1 assumptions passed" in out and "left out: x: nothing there" in out
+    found = passport.find(paper_study())
+    assert found is not None and (found.passed, found.rows, found.failed) == (1, 1, ())
+
+    (tmp_path / "heavy.toml").write_text("[machine]\nplatform_mass = 0.5\n")
+    heavy = load_study(tmp_path / "heavy.toml")
+    assert passport.find(heavy) is None
+    checks["two"] = lambda _: [row(1.0, note="off")]
+    code, out, _ = call(capsys, "verify", tmp_path / "heavy.toml", "--json")
+    document = json.loads(out)
+    jsonschema.validate(document, schema("verify"))
+    assert code == 1 and document["failed"] == ["x"] and document["passed"] == 1
+    assert "failed: x" in passport.find(heavy).text and passport.find(paper_study()).failed == ()
+    # whatever its title
+    assert passport.find(heavy.model_copy(update={"title": "heavy"})).failed == ("x",)
+
+
+@pytest.mark.parametrize(("width", "columns"), [(60, 4), (80, 5), (120, 6)])
+def test_the_table_fits_the_terminal(checks, capsys, width, columns):
+    word = "pinned_pinned"
+    checks["one"] = lambda _: [row(1e-4)._replace(assumption=f"links ({word})", against=word)]
+    console = Console(width=width)
+    commands._print(run.verify_study(), console)
+    table, text = capsys.readouterr().out.split("└")
+    assert f"({word})" in table and "…" not in table and "1 of 1" in text
+    lines = table.splitlines()
+    assert max(map(len, lines)) <= width and lines[3].count("│") == columns + 1
+
+
+def test_a_check_that_cannot_run_fails(checks, capsys):
+    def broken(_):
+        raise ValueError("no figures")
+
+    checks["two"] = broken
+    code, out, _ = call(capsys, "verify")
+    assert code == 1 and "FAILED: two: it could not be checked: no figures" in out
+
+
+def test_a_damaged_outcome_is_none(checks, capsys):
+    call(capsys, "verify")
+    (file,) = passport.chosen_folder().glob("passport-*")
+    endless = '{"title": "", "passed": Infinity}'
+    changed = file.read_text().replace('"passed": 1', '"passed": 2')
+    for text in (
+        changed,
+        "",
+        "{",
+        "[1]",
+        '{"title": "", "passed": "many"}',
+        endless,
+        "[" * 100_000,
+    ):
+        file.write_text(text)
+        assert passport.find(paper_study()) is None
+    file.unlink()
+    os.mkfifo(file)
+    assert passport.find(paper_study()) is None
