@@ -121,6 +121,7 @@ class Budget:
         )
         return result
 
+    @pytest.hookimpl(optionalhook=True)  # of pytest-xdist
     def pytest_testnodedown(self, node: Any) -> None:
         for name, cost in getattr(node, "workeroutput", {}).get("spent", {}).items():
             self.spent[name] = self.spent[name].plus(*cost)
