@@ -315,7 +315,8 @@ class BlockFunction:
 
     @cached_property
     def _on_device(self) -> list[Any]:
-        return [jnp.asarray(x) for x in self.shared]
+        leaves: list[Any] = jax.device_put(self.shared)
+        return leaves
 
     def _movement(
         self, free_axis: int | None, own: Any, shared: Any

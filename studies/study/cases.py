@@ -27,7 +27,6 @@ from jaxmodel.case import (
 )
 from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
-from jaxmodel.laws.contract import Law
 from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES
 from jaxmodel.parameters import Beam, Damping, Machine, Masses, Patches
 from studies.study.consistency import patch_centers
@@ -315,13 +314,6 @@ def _control(numbers: Numbers, structure: Structure, xp: Any) -> Control:
         parameters={x.name: number(f"{OWN_LAWS}.{law.name}.{x.name}") for x in law.parameters},
         system=numbers.get("state_space"),
     )
-
-
-def law_parameters(study: Study, law: Law) -> dict[str, np.ndarray]:
-    """A law's own fields in a study, whichever law the study selects, (n,) each."""
-    fields = Fields(study)
-    names = [x.name for x in law.parameters]
-    return {name: fields.each_link(f"{OWN_LAWS}.{law.name}.{name}")[0] for name in names}
 
 
 def signed_power(ratio: Any, exponent: Any, xp: Any = np) -> Any:

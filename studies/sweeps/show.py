@@ -317,11 +317,6 @@ def _number_text(data: SweepData, name: str, record: Record) -> str:
     return f"{value:.4g}"
 
 
-def short_id(data: SweepData, case: int) -> str:
-    """Start of a case's id that identifies it; unlike its number, it is the same in any sweep."""
-    return str(data["case_id"][case])[:ID_DIGITS]
-
-
 def print_left_out(data: SweepData, console: Console) -> None:
     """Report how many cases are not ok and hence left out."""
     codes = data["status"]
