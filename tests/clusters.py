@@ -8,22 +8,32 @@ import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import numpy as np
 import psutil
 
 import studies
+from jaxmodel import status
 from studies.cluster.connect import Workers, connected
+from studies.screen.shards import axis_columns
+from studies.screen.tally import tally_of
 
-#: Chunks of 16 cases as in the other tests, and what the file `trouble` asks for.
+#: Chunks of 16 cases as in the other tests, and what the file `trouble` asks for. Programs are
+#: kept, so that a worker that is started again has them.
 PRELOAD = """
 import json, os, time
 from pathlib import Path
+from studies import config
 from studies.cluster import worker
 from studies.engine import plan
+from studies.screen import workers
+from tests.clusters import judged
 
 plan.LANES, plan.LARGEST_CHUNK = 8, 16
+config.keep_programs()
 trouble = Path(os.environ["TROUBLE"])
 # this file may be run twice
 start, identity = worker.__dict__.setdefault("plain", (worker.start_chunk, worker.identity))
+run = workers.__dict__.setdefault("plain", workers.shard_tally)
 
 def started(executor, table, rows, *more):
     asked = json.loads(trouble.read_text())
@@ -36,9 +46,20 @@ def started(executor, table, rows, *more):
         time.sleep(1000)
     return start(executor, table, rows, *more)
 
+def tallied(*shard):
+    return judged(*shard) if json.loads(trouble.read_text()).get("judged") else run(*shard)
+
 worker.start_chunk = started
+workers.shard_tally = tallied
 worker.identity = lambda: identity() | json.loads(trouble.read_text()).get("identity", {})
 """
+
+
+def judged(screen, shard, table, stop):
+    """Tally of designs that are not run: each is as good as its gain, and the largest are lost."""
+    gain = table.columns["control.gain_factor"]
+    lost = np.where(gain > 0.9, status.UNSTABLE, status.OK)
+    return tally_of(table.row, lost, gain, axis_columns(table), screen.axes, *screen.ranking)
 
 
 class Machines:
@@ -64,7 +85,10 @@ class Machines:
             time.sleep(0.05)
 
     def trouble(self, **asked):
-        """What goes wrong from now on: `kill`, `fail` or `hang` with a case, other `identity`."""
+        """What goes wrong from now on: `kill`, `fail` or `hang` with a case, other `identity`.
+
+        With `judged`, shards of a screen are not run.
+        """
         self._trouble.write_text(json.dumps(asked))
 
     def add_worker(self):

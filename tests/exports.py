@@ -1,4 +1,4 @@
-"""Designs that tests of exports share; few samples and modes, so that they run fast."""
+"""Designs that tests of exports share; few samples and modes, and one program for all."""
 
 import shutil
 import subprocess
@@ -13,10 +13,10 @@ from studies.study.template import study_template
 
 _HOME = list(paper_study().motion.waypoints[0])
 _SHORT = {
-    "run": {"duration": 0.08},
-    "link": {"modes": 4},
+    "run": {"duration": 0.05},
+    "link": {"modes": 3},
     "motion": {"waypoints": [_HOME, [0.0, 0.01, _HOME[2]]], "move_time": 0.02},
-    "metrics": {"residual_delay": 0.0, "residual_length": 0.03},
+    "metrics": {"residual_delay": 0.0, "residual_length": 0.01},
 }
 #: The paper's gains at full strength, three modes on three links.
 PAPER = {**_SHORT, "title": "paper's gains", "control": {"velocity_gain": [3.1, 3.5, 3.4]}}
@@ -41,11 +41,15 @@ TUNED = {
 SINGLE = {
     **_SHORT,
     "electronics": {"adc_bits": 16},
-    "link": {"modes": 4, "length": [0.2, 0.21, 0.2], "thickness": [2.0e-3, 2.1e-3, 1.9e-3]},
+    "link": {"modes": 3, "length": [0.2, 0.21, 0.2], "thickness": [2.0e-3, 2.1e-3, 1.9e-3]},
     "machine": {"guide_offsets": [0.0, 0.005, 0.0]},
     "load": {"mass": 0.05, "offset": [0.01, -0.005]},
     "title": "two modes, one link of three different ones",
-    "control": {"modes": 2, "links": [False, True, False], "feedthrough_factor": 0.7},
+    "control": {
+        "links": [False, True, False],
+        "mode_mask": [[True, True, False]] * 3,  # of as many modes as PAPER has: one program
+        "feedthrough_factor": 0.7,
+    },
 }
 DESIGNS = {"paper": PAPER, "tuned": TUNED, "single": SINGLE}
 
@@ -60,7 +64,10 @@ def changed(data, **sections):
 KINDS = {
     "paper": PAPER,
     "tuned": TUNED,
-    "feed-through": SINGLE,
+    "feed-through, two modes": {
+        **SINGLE,
+        "control": {"modes": 2, "links": [False, True, False], "feedthrough_factor": 0.7},
+    },
     "difference and position gain": changed(
         PAPER,
         electronics={"estimator": "difference"},

@@ -3,12 +3,16 @@
 import numpy as np
 
 from studies.fitting.kinds.modes import TWO_PI
+from studies.fitting.kinds.motions import Recording
 from studies.fitting.measurements import guess, make_bench, make_measurements
+from studies.fitting.problem import make_problem
+from studies.fitting.solve import descend
 from studies.fitting.spec import parse_fit
+from studies.fitting.statistics import describe_fit
 
 SHORT = {
     "run": {"duration": 0.06},
-    "link": {"modes": 3, "damping_ratio": 0.012},
+    "link": {"modes": 2, "damping_ratio": 0.012},
     "control": {"modes": 2, "gain_factor": 0.4},
     "motion": {
         "waypoints": [[0.0, 0.0, 0.5235987755982988], [0.0, 0.01, 0.5235987755982988]],
@@ -21,6 +25,12 @@ FREE = {
     "link.youngs_modulus": {"from": 60e9, "to": 80e9},
     "link.damping_ratio": {"from": 0.002, "to": 0.04},
     "machine.platform_mass": {"from": 0.15, "to": 0.35},
+}
+#: Three links that differ, and what is free of them where faults are sought.
+UNEQUAL = {"link": SHORT["link"] | {"youngs_modulus": [66e9, 70e9, 75e9]}}
+FREE_OF_UNEQUAL = {
+    "link.stiffness_factor": {"from": 0.8, "to": 1.2},
+    "link.damping_ratio": {"from": 0.002, "to": 0.04},
 }
 MODES = {
     "kind": "modes",
@@ -69,17 +79,52 @@ REDUCTION = FIGURES | {
     "links": [True, True, False],
     "modes": 1,
 }
+#: At mid-span, as the stations of a bench without such instruments: its programs serve all.
 HAMMER = RESPONSE | {
-    "input": "hammer 2 at 0.07",
+    "input": "hammer 2 at 0.1",
     "output": "deflection 3 at 0.1",
     "quantity": "acceleration",
     "sigma": 0.02,
 }
-ACCELEROMETER = RESPONSE | {"input": "slider 1", "output": "accelerometer 2 at 0.06 to 40"}
+ACCELEROMETER = RESPONSE | {"input": "slider 1", "output": "accelerometer 2 at 0.1 to 40"}
 MOTOR = RESPONSE | {"input": "command 1", "output": "motor 1"}
 MAGNITUDE = HAMMER | {"magnitude": "real"}
+SENSORS = ["sensor 1.1", "sensor 2.1", "sensor 3.1"]
+DECAY = {
+    "kind": "decay",
+    "pose": ASKEW,
+    "file": "decay.csv",
+    "outputs": SENSORS,
+    "from_hz": 60.0,
+    "to_hz": 300.0,
+}
 FREQUENCY = np.linspace(60.0, 500.0, 200)
 TIME = np.linspace(0.01, 0.059, 180)
+
+
+#: Step of derivatives through complex numbers, exact to rounding.
+TINY_STEP = 1e-30
+
+
+class Ringing:
+    """A run whose outputs ring in closed form, in place of a `Motion`; parameters are `FREE`."""
+
+    patches = (3, 3)
+
+    def find(self, name, signal, values, has_slopes):
+        """One output: its own frequency and size, by modulus, damping ratio and mass."""
+        time = np.linspace(0.0, 0.06, 601)
+
+        def value(x):
+            omega = 2 * np.pi * (90.0 + 20 * signal.link + 7 * signal.patch) * np.sqrt(x[0] / 7e10)
+            size = (5.0 + 2 * signal.link - signal.patch) / (1 + x[2])
+            return size * np.exp(-10 * x[1] * omega * time) * np.sin(omega * time + signal.link)
+
+        slope = None
+        if has_slopes:
+            steps = values + 1j * TINY_STEP * np.diag(values)
+            slope = np.stack([value(x).imag for x in steps], axis=1) / (TINY_STEP * values)
+        return Recording(time, 0.03, value(values), slope)
 
 
 def write(folder, name, **columns):
@@ -106,6 +151,27 @@ def made(spec, bench=None):
     """Bench and measurements; bench: one that serves all entries, whose programs are compiled."""
     bench = bench or make_bench(spec)
     return bench, make_measurements(spec, bench), guess(spec)
+
+
+def posed(spec, bench=None):
+    """The problem of a fit; bench: as for `made`."""
+    bench, every, _ = made(spec, bench)
+    return make_problem(spec, bench, every)
+
+
+def followed(problem):
+    """The optimum that the study leads to, without other starting points."""
+    u = problem.free.places()
+    for _ in range(2):  # the noise of the second is that of the first one's model
+        u = descend(problem, u, 60).u
+        for one in problem.measurements:
+            one.reweigh(problem.free.values(u))
+    return u
+
+
+def answered(problem):
+    """What a fit says there."""
+    return describe_fit(problem, followed(problem))
 
 
 def measured_modes(bench, one, values):
@@ -137,3 +203,20 @@ def give_data(bench, one, values, rng):
         one.measured = one.measured + one.sigma * rng.normal(size=len(exact))
     else:
         one.measured = exact + one.sigma * (rng.normal(size=(2, len(exact))).T @ [1, 1j])
+
+
+def write_decays(folder, bench, values):
+    """A file with three decays of 0.5 s after impulses of one actuator each."""
+    rate, rng = 10000.0, np.random.default_rng(3)  # above all modes
+    plant = bench.plant(tuple(ASKEW), values, False)
+    pole, right, left = plant.eigen
+    rows = plant.value.sensor[:: bench.n_patches]
+    course = np.exp(np.outer(np.arange(5000) / rate, pole))
+    parts = []
+    for link in range(3):
+        start = left @ plant.value.actuator[:, link * bench.n_patches]
+        parts.append(((course * start) @ right.T @ rows.T).real)
+    signals = np.concatenate(parts) / np.std(parts)
+    signals += 0.002 * rng.normal(size=signals.shape)
+    columns = dict(zip(SENSORS, signals.T, strict=True))
+    write(folder, DECAY["file"], time=np.arange(15000) / rate, **columns)

@@ -1,4 +1,8 @@
-"""Closed-form accelerations beside those of the Lagrangian and of the multiplier form."""
+"""Closed-form accelerations beside those of the Lagrangian and of the multiplier form.
+
+The closed forms are evaluated operation by operation, with states as lanes in the last axis: no
+program for each set of parts that a plant may have. The others are one program for all bases.
+"""
 
 from functools import partial
 
@@ -23,6 +27,12 @@ def build(kind, machine, mask, stations):
 def make(kind, machine=MACHINE, mask=1.0, stations=(0.1,), shortening="lumped"):
     """Basis and plant as plain arrays."""
     made = jax.tree.map(np.asarray, build(kind, machine, mask, np.array(stations)))
+    return reduced(*made, shortening)
+
+
+def reduced(basis, plant, shortening):
+    """The parts that a bent link's shorter chord has: "distributed", "lumped" or "none"."""
+    made = basis, plant
     if shortening != "distributed":
         made = tuple(part._replace(inward=None, centrifugal=None) for part in made)
     if shortening == "none":
@@ -30,29 +40,64 @@ def make(kind, machine=MACHINE, mask=1.0, stations=(0.1,), shortening="lumped"):
     return made
 
 
-@jax.jit
+def lanes_last(tree):
+    """Arrays with their first axis last."""
+    return jax.tree.map(lambda x: np.moveaxis(np.asarray(x), 0, -1), tree)
+
+
+def one_lane(tree):
+    """The same numbers in every lane."""
+    return jax.tree.map(lambda x: np.asarray(x)[..., None], tree)
+
+
+def closed_form(plant, motion, loads):
+    """Chain and accelerations of lanes, (n, ...); plant as from `one_lane` or `lanes_last`."""
+    found = reference.closed_form(plant, lanes_last(motion), lanes_last(loads))
+    return jax.tree.map(lambda x: np.moveaxis(np.asarray(x), -1, 0), found)
+
+
+def general(machine, basis):
+    """The same basis with all parts that a basis may have, which are zero or follow from others."""
+    still, one = np.zeros(basis.mass.shape), np.eye(basis.mass.shape[-1])
+    none = still[..., None] * one
+    own = still if basis.shortening is None else basis.shortening
+    mixed = none if basis.mixed_shortening is None else basis.mixed_shortening
+    mu = basis.first_moment / np.asarray(machine.beam.length)
+    lumped = mu[..., None, None] * (own[..., None] * one + mixed)
+    return basis._replace(
+        tip=still if basis.tip is None else basis.tip,
+        shortening=own,
+        mixed_shortening=mixed,
+        inward=lumped if basis.inward is None else basis.inward,
+        centrifugal=none if basis.centrifugal is None else basis.centrifugal,
+    )
+
+
+@partial(jax.jit, static_argnums=0)
 @partial(jax.vmap, in_axes=(None, None, None, 0, 0))
-def all_forms(machine, basis, plant, motion, loads):
-    """Chain and accelerations of `jaxmodel`, and the two others'."""
-    return (
-        reference.closed_form(plant, motion, loads),
-        reference.by_lagrangian(machine, basis, motion, loads),
-        reference.by_multipliers(machine, basis, motion, loads),
-    )
+def _by(form, machine, basis, motion, loads):
+    return form(machine, basis, motion, loads)
 
 
-def check_forms(found, lagrangian, multipliers):
-    """Accelerations agree to 1e-10 of their largest entry in every state."""
-    (pose_l, q_l), (pose_m, q_m, rho_m, beta_m) = lagrangian, multipliers
-    pairs = (
-        (found.pose, pose_l),
-        (found.modal, q_l),
-        (found.pose, pose_m),
-        (found.modal, q_m),
-        (found.rho, rho_m),
-        (found.beta, beta_m),
-    )
-    for mine, wanted in pairs:
-        axes = tuple(range(1, wanted.ndim))
-        error = np.abs(mine - wanted).max(axis=axes) / np.abs(wanted).max(axis=axes)
+def by_lagrangian(machine, basis, motion, loads):
+    """`reference.by_lagrangian` of states of one machine."""
+    return _by(reference.by_lagrangian, machine, general(machine, basis), motion, loads)
+
+
+def check_multipliers(machine, basis, plant, motion, loads):
+    """Accelerations agree with the multiplier form to 1e-10 of their largest entry in every state.
+
+    Returns the chain and the accelerations.
+    """
+    chain, found = closed_form(one_lane(plant), motion, loads)
+    wanted = _by(reference.by_multipliers, machine, general(machine, basis), motion, loads)
+    check_rows((found.pose, found.modal, found.rho, found.beta), wanted)
+    return chain, found
+
+
+def check_rows(found, wanted):
+    """Rows of arrays agree to 1e-10 of their largest entry."""
+    for mine, theirs in zip(found, wanted, strict=True):
+        axes = tuple(range(1, theirs.ndim))
+        error = np.abs(mine - theirs).max(axis=axes) / np.abs(theirs).max(axis=axes)
         assert error.max() < 1e-10

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache, partial
+from functools import cache
 from typing import NamedTuple
 
 import jax
@@ -11,12 +11,11 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.sampled_loop import closed_loop
-from studies.engine.stability import gain_margin, with_margin_modes
+from studies.engine.stability import _loops, gain_margin, with_margin_modes
 from studies.study.cases import build_cases, build_structure
-from studies.study.spec import paper_study
+from tests.canonical import MACHINE, study_of
 
-STUDY = paper_study().change(link__modes=8)
+STUDY = study_of(MACHINE)
 
 
 class Loops(NamedTuple):
@@ -57,21 +56,24 @@ def random_loops(count: int, seed: int) -> Loops:
     structure = build_structure(STUDY)._replace(n_steps=1, n_controlled=3)
     cases = build_cases(STUDY, columns, structure)
     cases = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape[1:])), cases)
-    return Loops(structure, cases._replace(path=cases.path._replace(waypoints=pose[:, None])))
+    points = np.broadcast_to(pose[:, None], cases.path.waypoints.shape)
+    return Loops(structure, cases._replace(path=cases.path._replace(waypoints=points)))
 
 
-@partial(jax.jit, static_argnums=0)
-def _matrices(structure: Structure, cases: Case):
-    def one(case: Case):
-        found = closed_loop(structure, case, case.path.waypoints[0])
-        return found.open, found.feedback
-
-    return jax.lax.map(one, cases)
+def matrices(structure: Structure, cases: Case) -> tuple[np.ndarray, np.ndarray]:
+    """Of the loops at rest, open and what the gains add to them, (n, m, m) each."""
+    opened, feedback = [], []
+    for k in range(len(cases.path.waypoints)):
+        case = jax.tree.map(lambda x, k=k: np.asarray(x)[k], cases)
+        found = _loops(structure, False, case, case.path.waypoints[0], None).at_rest
+        opened.append(np.asarray(found.open)[0])
+        feedback.append(np.asarray(found.feedback)[0])
+    return np.array(opened), np.array(feedback)
 
 
 def exact_margins(loops: Loops) -> np.ndarray:
     """By eigenvalues, (n,)."""
-    opened, feedback = map(np.asarray, _matrices(*with_margin_modes(*loops)))
+    opened, feedback = matrices(*with_margin_modes(*loops))
 
     def margin(k: int) -> float:
         return gain_margin(cache(lambda f: np.linalg.eigvals(opened[k] + f * feedback[k])))

@@ -1,9 +1,13 @@
 """A small sweep that all tests of the batch engine share, so that it is compiled once."""
 
 import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
+from studies.engine import plan
+from studies.screen import shards
 from studies.space.spec import parse_sweep
 
 HOME_PHI = float(np.pi / 6)
@@ -35,6 +39,20 @@ def small(sweep=MIXED, **sections):
 
 def small_spec(sweep=MIXED, **sections):
     return parse_sweep(small(sweep, **sections))
+
+
+@contextmanager
+def narrow_blocks(largest_chunk: int = plan.LARGEST_CHUNK) -> Iterator[None]:
+    """Blocks of 8 cases, so that sweeps of all sizes share programs.
+
+    Not by `monkeypatch`, which keeps no programs: these are kept by their sizes.
+    """
+    before = plan.LANES, shards.LANES, plan.LARGEST_CHUNK
+    plan.LANES, shards.LANES, plan.LARGEST_CHUNK = 8, 8, largest_chunk
+    try:
+        yield
+    finally:
+        plan.LANES, shards.LANES, plan.LARGEST_CHUNK = before
 
 
 #: Sections of a fast move without a shaper.

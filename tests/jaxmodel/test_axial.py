@@ -11,6 +11,7 @@ import pytest
 import studies
 from jaxmodel import axial, status
 from jaxmodel.bases import find_bases
+from jaxmodel.dynamics import modal_chain
 from jaxmodel.kinematics import close_chain
 from jaxmodel.linear import Moment, linearise, natural_modes
 from jaxmodel.mechanisms.prrr.paper import HOME
@@ -37,6 +38,12 @@ def arrays(study):
     return build_structure(study), as_arrays(build_case(study))
 
 
+def simulated(structure, case, *metrics):
+    """A run with its record and few metrics: what nobody asks for takes time to compile."""
+    few = structure._replace(metrics=metrics or ("residual_rms",), n_frequencies=1)
+    return _simulate(few, case, True)
+
+
 @partial(jax.jit, static_argnums=0)
 def plant_of(structure, case):
     return prepare(structure, case).loop.plant
@@ -46,6 +53,11 @@ def plant_of(structure, case):
 def linear_at(structure, case, pose, moment):
     loop = prepare(structure, case).loop
     return linearise(structure, loop, pose, moment)
+
+
+close = jax.jit(close_chain)
+axial_force = jax.jit(axial.axial_force)
+loaded_frequency = jax.jit(axial.loaded_frequency)
 
 
 def bending(study, wrench=(0.0, 0.0, 0.0), acceleration=(0.0, 0.0, 0.0)):
@@ -83,7 +95,7 @@ def fast_square(**changes):
         metrics__residual_length=0.1,
         **changes,
     )
-    record = _simulate(*arrays(study), True).record
+    record = simulated(*arrays(study)).record
     at = np.round(given.time / 1e-4).astype(int)
     deflection = np.asarray(record.chord_deflection_stations)[at, :, 0]
     return given.time, (deflection, given.deflection), (np.asarray(record.pose)[at], given.pose)
@@ -92,7 +104,7 @@ def fast_square(**changes):
 FAST = [
     pytest.param({"link__modes": 3}, marks=pytest.mark.long),
     {"link__modes": 8},
-    {"link__modes": 8, "link__axial_inertia": "distributed"},
+    pytest.param({"link__modes": 8, "link__axial_inertia": "distributed"}, marks=pytest.mark.long),
 ]
 
 
@@ -106,6 +118,7 @@ def test_fast_moves_equal_finite_elements(changes):
     np.testing.assert_allclose(pose[:, 2], true_pose[:, 2], atol=2e-6)
 
 
+@pytest.mark.long  # in short: a preload that the model without shortening does not feel, below
 def test_the_model_without_shortening_is_far_off_on_fast_moves():
     """What the comparison above must notice: 5 % of the peak."""
     _, (deflection, wanted), _ = fast_square(link__shortening=False)
@@ -127,20 +140,31 @@ HEAVY_LINKS = BARE.change(
 )
 
 
+#: Of the lumped model of these links, by a run of each model: see the long test.
+HEAVY_ERROR = 0.00959
+
+
 def test_lumped_inertia_of_heavy_links_is_estimated_and_reported():
     with pytest.warns(ModelWarning, match=r"link\.axial_inertia = 'lumped' .* about") as found:
-        lumped, case = check_run(HEAVY_LINKS)
+        check_run(HEAVY_LINKS)
     words = next(text for x in found if "axial_inertia" in (text := str(x.message)))
     estimate = float(words.split("about ")[1].split(" %")[0]) / 100
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", "link.basis = .* leaves out the patches")
-        distributed, _ = check_run(HEAVY_LINKS.change(link__axial_inertia="distributed"))
+        check_run(HEAVY_LINKS.change(link__axial_inertia="distributed"))
         check_run(HEAVY_LINKS.change(link__shortening=False))
-    results = (_simulate(x, case, True) for x in (lumped, distributed))
+    # undamped: phases drift apart
+    assert estimate / 3 < HEAVY_ERROR < 3 * estimate
+
+
+@pytest.mark.long
+def test_runs_of_heavy_links_differ_as_the_estimate_expects():
+    studies = (HEAVY_LINKS.change(link__axial_inertia=x) for x in ("lumped", "distributed"))
+    results = (simulated(*arrays(x)) for x in studies)
     mine, true = (np.asarray(x.record.chord_deflection_stations) for x in results)
     error = np.abs(mine - true).max() / np.abs(true).max()
-    assert estimate / 3 < error < 3 * estimate  # undamped: phases drift apart
+    assert error == pytest.approx(HEAVY_ERROR, rel=1e-2)
 
 
 HELD = BARE.change(drive__locked=True, machine__platform_mass=1e3, machine__platform_inertia=1e2)
@@ -153,14 +177,14 @@ def test_axial_force_changes_the_frequency_of_a_link_between_held_ends(wrench):
     structure, case = arrays(HELD)
     plant = plant_of(structure, case)
     still = np.zeros(3)
-    found = axial.axial_force(plant, HOME_POSE, still, still, np.array(wrench))
+    found = axial_force(plant, HOME_POSE, still, still, np.array(wrench))
     np.testing.assert_allclose(found, tension, atol=1e-9)
     np.testing.assert_allclose(axial.critical_force(plant), N_CR, rtol=1e-12)
     first = 1 + tension[:, None] / (np.arange(1, 4) ** 2 * N_CR)
     wanted = np.sort((114.388 * np.arange(1, 4) ** 2 * np.sqrt(first)).ravel())
     scale = 114.388 / (np.asarray(plant.stiffness / plant.modal_mass[:, None])[0, 0] ** 0.5)
     np.testing.assert_allclose(
-        np.sort(np.ravel(axial.loaded_frequency(plant, found))) * scale, wanted, rtol=1e-12
+        np.sort(np.ravel(loaded_frequency(plant, found))) * scale, wanted, rtol=1e-12
     )
     # the whole machine, its ends held by inertia, has the same frequencies
     held = bending(HELD, wrench)[:9] * 2 * np.pi * scale
@@ -170,7 +194,7 @@ def test_axial_force_changes_the_frequency_of_a_link_between_held_ends(wrench):
 def test_axial_force_of_straight_links_is_the_same_in_every_basis():
     wrench, acceleration = np.array([7.0, -3.0, 0.2]), np.array([5.0, 20.0, -30.0])
     forces = [
-        axial.axial_force(
+        axial_force(
             plant_of(*arrays(BARE.change(link__basis=kind))),
             HOME_POSE,
             np.array([0.2, 0.1, 0.5]),
@@ -190,25 +214,31 @@ def test_static_preload_equals_finite_elements():
     np.testing.assert_allclose(without, [114.73, 115.19, 115.20], atol=0.01)
 
 
+#: Runs that share a program: a wrench, several plant steps a sample.
+LOADED = BARE.change(
+    run__duration=0.1,
+    run__substeps=4,
+    metrics__residual_delay=0.0,
+    metrics__residual_length=0.02,
+    shaper__kind="none",
+    motion__waypoints=(HOME, HOME),
+    motion__move_time=0.02,
+    load__wrench=(20.0, 0.0, 0.1),
+)
+
+
 @pytest.mark.parametrize(("share", "code"), [(0.99, status.OK), (1.01, status.BUCKLED)])
 def test_a_load_beyond_the_critical_force_is_a_status(share, code):
     """The moment that compresses all links alike up to N_cr, and a little beyond."""
     moment = -share * N_CR * 5.0 / statics((0.0, 0.0, 5.0))[0]
-    study = BARE.change(
-        run__duration=0.1,
-        metrics__residual_delay=0.0,
-        metrics__residual_length=0.001,
-        shaper__kind="none",
-        motion__waypoints=(HOME,),
-    )
-    structure, case = arrays(study)
+    structure, case = arrays(LOADED)
     load = case.load._replace(wrench=np.array([0.0, 0.0, moment]))
-    result = _simulate(structure._replace(has_wrench=True), case._replace(load=load), True)
+    result = simulated(structure, case._replace(load=load))
     assert result.status == code
     assert np.isfinite(result.metrics.residual_rms).all() == (code == status.OK)
     if code == status.BUCKLED:
         with pytest.raises(StudyError, match=r"load.wrench.*115.1 N .here link .: 116.3 N"):
-            check_run(study.change(load__wrench=(0.0, 0.0, moment)))
+            check_run(LOADED.change(load__wrench=(0.0, 0.0, moment)))
 
 
 def test_links_buckle_before_a_path_leaves_the_reach():
@@ -231,23 +261,14 @@ def test_links_buckle_before_a_path_leaves_the_reach():
 
 
 def test_a_steady_load_is_held_and_a_pulse_moves_the_platform():
-    study = BARE.change(
-        drive__kd=60.0,
-        run__duration=0.1,
-        metrics__residual_delay=0.0,
-        metrics__residual_length=0.02,
-        shaper__kind="none",
-        motion__waypoints=(HOME,),
-        load__wrench=(20.0, 0.0, 0.1),
-        link__damping_ratio=0.01,
-    )
-    held = _simulate(*arrays(study), True)
+    study = LOADED.change(drive__kd=60.0, link__damping_ratio=0.01)
+    held = simulated(*arrays(study))
     np.testing.assert_allclose(held.record.pose, np.tile(HOME, (1000, 1)), atol=1e-12)
     # a long pulse: the platform sags as on the springs of the drive, dX = (J^t Kp J)^-1 W
     pulse = {"load__pulse": (5.0, 0.0, 0.0), "load__pulse_length": 0.1}
-    pushed = _simulate(*arrays(study.change(**pulse)), True)
-    plant = plant_of(*arrays(study))
-    jacobian = jax.jacfwd(lambda at: close_chain(plant, at, np.zeros(3)).rho)(HOME_POSE)
+    pushed = simulated(*arrays(study.change(**pulse)))
+    plant = plant_of(*arrays(BARE))
+    jacobian = np.stack([close(plant, HOME_POSE, rate).rho_rate for rate in np.eye(3)], axis=1)
     sag = np.linalg.solve(jacobian.T @ jacobian * 2e4, [5.0, 0.0, 0.0])
     moved = np.asarray(pushed.record.pose[-1]) - HOME_POSE
     np.testing.assert_allclose(moved[:2], sag[:2], atol=0.02 * sag[0])
@@ -262,10 +283,10 @@ def test_stretch_error_is_the_geometry_of_longer_links(pose):
     plant = plant_of(*arrays(BARE))
     stretch = 1e-6 * np.array([3.0, -2.0, 1.0])
     still = np.zeros(3)
-    chain = close_chain(plant, pose, still)
-    found = np.asarray(axial.stretch_error(chain, stretch))
+    chain = close(plant, pose, still)
+    found = np.asarray(jax.jit(axial.stretch_error)(chain, stretch))
     longer = plant._replace(length=plant.length + stretch)
-    moved = close_chain(longer, pose + found, still)
+    moved = close(longer, pose + found, still)
     np.testing.assert_allclose(moved.rho, chain.rho, atol=1e-10)  # the sliders stay
     np.testing.assert_allclose(axial.axial_compliance(arrays(BARE)[1].machine), 0.2 / 1.4e6)
 
@@ -280,7 +301,7 @@ def test_ked_has_no_coupled_frequencies():
     assert np.ptp(bending(BARE)[:3]) > 0.4
 
 
-@pytest.mark.long  # in short: what bends links in KED, and where it fails
+@pytest.mark.long  # in short: what bends links in KED, in test_dynamics
 def test_ked_leaves_uncontrolled_links_as_they_are():
     """Table 1 would read exactly 0 %: control of link 1 changes links 2 and 3 by nothing."""
     study = paper_study().change(
@@ -304,31 +325,10 @@ def test_ked_leaves_uncontrolled_links_as_they_are():
     assert np.abs(coupled[1:]).min() > 0.005
 
 
-def test_ked_bends_links_by_the_rigid_motion_alone():
-    """A heavy, stiffly driven machine follows its command, and both models bend alike."""
-    study = paper_study().change(
-        link__modes=3,
-        motion__move_time=0.06,
-        shaper__kind="none",
-        run__duration=0.3001,
-        metrics__residual_delay=0.0,
-        metrics__residual_length=0.05,
-        metrics__stations=(0.5,),
-        control__feedback="none",
-        drive__kp=1e7,
-        drive__kd=3e3,
-        machine__slider_mass=20.0,
-        machine__platform_mass=50.0,
-        machine__platform_inertia=0.05,
-        link__shortening=False,
-    )
-    ked, coupled = (
-        np.asarray(_simulate(*arrays(study.change(run__model=m)), True).metrics.structural_peak)
-        for m in ("ked", "coupled")
-    )
-    np.testing.assert_allclose(ked, coupled, rtol=0.03)
+KED_METRICS = ("structural_peak", "residual_rms")
 
 
+@pytest.mark.long  # in short: what bends links in KED, in test_dynamics
 @pytest.mark.parametrize(("kp", "peak", "residual"), [(2e4, 0.01, 0.15), (1e5, 0.08, None)])
 def test_ked_fails_where_the_drive_rings_with_the_links(kp, peak, residual):
     """Two cells of the map of docs/reference/exploring.md: 10 mm in 0.05 s."""
@@ -344,7 +344,7 @@ def test_ked_fails_where_the_drive_rings_with_the_links(kp, peak, residual):
         drive__kp=kp,
     )
     coupled, ked = (
-        _simulate(*arrays(study.change(run__model=model)), False).metrics
+        simulated(*arrays(study.change(run__model=model)), *KED_METRICS).metrics
         for model in ("coupled", "ked")
     )
 
@@ -378,9 +378,9 @@ def test_margins_move_with_the_forces_of_the_motion():
 def test_frequencies_move_with_the_forces_of_the_motion():
     """A heavy platform that accelerates by 0.04 m/s2 pulls and pushes with 40 N."""
     plant, acceleration = plant_of(*arrays(HELD)), np.array([0.0, 0.04, 0.0])
-    tension = axial.axial_force(plant, HOME_POSE, np.zeros(3), acceleration)
+    tension = axial_force(plant, HOME_POSE, np.zeros(3), acceleration)
     np.testing.assert_allclose(tension, statics((0.0, -40.0, 0.0)), atol=0.01)  # and the links' own
-    wanted = np.sort(np.ravel(axial.loaded_frequency(plant, tension))) / (2 * np.pi)
+    wanted = np.sort(np.ravel(loaded_frequency(plant, tension))) / (2 * np.pi)
     np.testing.assert_allclose(bending(HELD, acceleration=acceleration)[:9], wanted, rtol=1e-6)
 
 
@@ -396,19 +396,24 @@ def test_the_measured_machine_has_a_margin(modes):
     assert 92 < found.frequency_hz[0].min() < 97 and found.damping_ratio[0].min() > 0.08
 
 
+MEASURED = load_study(SPECS / "measured.toml").change(
+    motion__move_time=0.03,
+    control__links=(False,) * 3,
+    shaper__kind="none",
+    run__duration=0.5,
+    metrics__residual_delay=0.0,
+    metrics__residual_length=0.1,
+)
+
+
+@pytest.mark.long  # in short: where spectra are taken, in test_metrics
 def test_spectra_of_the_measured_machine_stand_on_their_peaks():
-    study = load_study(SPECS / "measured.toml").change(
-        motion__move_time=0.03,
-        control__links=(False,) * 3,
-        shaper__kind="none",
-        run__duration=0.5,
-        metrics__residual_delay=0.0,
-        metrics__residual_length=0.1,
-    )
-    result = _simulate(*arrays(study), False)
-    density = np.asarray(result.metrics.spectral_density)
+    density = np.asarray(_simulate(*arrays(MEASURED), False).metrics.spectral_density)
     assert (np.abs(density[:, 0].argmax(axis=-1) - 4) <= 1).all()  # of 9 points, +-10 %
-    bases = jax.jit(find_bases, static_argnums=0)(*arrays(study))
+
+
+def test_the_measured_machine_has_the_measured_frequencies():
+    bases = jax.jit(find_bases, static_argnums=0)(*arrays(MEASURED))
     held = np.asarray(bases.plant_omega) / (2 * np.pi)
     np.testing.assert_allclose(held, np.tile([92.5, 240.2], (3, 1)), rtol=1e-3)
 
@@ -438,12 +443,12 @@ def test_one_step_per_sample_is_enough_for_the_fastest_moves():
 
 
 def test_records_are_of_the_sampling_instant():
-    """However many steps lead to the next one."""
-    study = moved(0.01, 0.02, run__duration=0.04, metrics__residual_length=0.01)
-    one, four = (
-        np.asarray(_simulate(*arrays(study.change(run__substeps=n)), True).record.slider)
-        for n in (1, 4)
-    )
+    """However many steps lead to the next one, sliders are where pose and bending put them."""
+    study = LOADED.change(motion__waypoints=(HOME, (0.0, 0.01, HOME[2])))
+    record = jax.tree.map(np.asarray, simulated(*arrays(study)).record)
+    place = jax.jit(jax.vmap(partial(modal_chain, plant_of(*arrays(BARE)))))
+    pose, q = record.pose, record.modal_coordinate
+    wanted = place(pose, 0 * pose, q, 0 * q).rho
     # a step of the four moves sliders by far more than what follows allows
-    assert np.abs(np.diff(four, axis=0)).max() / 4 > 1e-5
-    np.testing.assert_allclose(one, four, rtol=0, atol=1e-7)
+    assert np.abs(np.diff(record.slider, axis=0)).max() / 4 > 1e-5
+    np.testing.assert_allclose(record.slider, wanted, rtol=0, atol=1e-12)

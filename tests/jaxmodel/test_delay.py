@@ -10,23 +10,24 @@ import pytest
 from jaxmodel import status
 from jaxmodel.case import Structure
 from jaxmodel.delay import LONGEST, command_change
+from jaxmodel.drives import DRIVES
 from jaxmodel.electronics import measurement_chain
 from jaxmodel.frequency_response import command_gain, response_of_loop
-from jaxmodel.nominal_loop import nominal_loop
 from jaxmodel.pairs import Pair
 from jaxmodel.prepare import prepare
 from jaxmodel.return_difference import delayed
-from jaxmodel.sampled_loop import closed_loop, sampled_plant
+from jaxmodel.sampled_loop import closed_loop
 from jaxmodel.simulate import simulate
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.spillover.certificate import certify
 from studies.spillover.plants import ModelMismatch
-from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.cases import build_structure
 from studies.study.spec import paper_study, parse_study
 from studies.tuning.optimise import optimise
 from studies.tuning.run import make_evaluator
 from studies.tuning.spec import parse_tuning
+from tests.jaxmodel.kept import arrays, loop_at, nominal_of, plant_at, prepared, simulated
 from tests.jaxmodel.test_notch import NOTCHES
 from tests.jaxmodel.test_onset import BASE, HOME, is_growing
 from tests.studies.engine.test_margins import assert_return_difference
@@ -39,10 +40,6 @@ ELECTRONICS = {"sensor_highpass_hz": 5.0, "amplifier_hz": 2e3}
 #: Without electronics each kind of check is a program of its own, and their special case.
 KINDS = [pytest.param({}, marks=pytest.mark.long), ELECTRONICS]
 DELAYS = (0.0, 0.125, 1.0, 2.625, 4.0)
-
-
-def arrays(study):
-    return build_structure(study), as_arrays(build_case(study))
 
 
 def small(delay, unmodelled=0.0, electronics=None, **sections):
@@ -106,17 +103,14 @@ def test_controller_knows_its_own_delay_only():
     np.testing.assert_allclose(other / one, np.exp(-1.5j * omega * 1e-4), rtol=1e-12)
 
 
-plant_of = jax.jit(sampled_plant, static_argnums=0)
-
-
 @pytest.mark.parametrize("electronics", KINDS, ids=["plain", "amplifier, high-pass"])
 @pytest.mark.parametrize("delay", [0.0, 0.375, 2.625, 4.0])
 def test_sampled_plant_is_that_of_a_queue_at_eight_times_the_rate(delay, electronics):
     """At 80 kHz, whole samples of delay, commands held for eight of them, by brute force."""
     study = small(1.0, delay - 1.0, electronics)
-    slow = jax.tree.map(np.asarray, plant_of(*arrays(study), POSE))
+    slow = jax.tree.map(np.asarray, plant_at(*arrays(study), POSE))
     fast = jax.tree.map(
-        np.asarray, plant_of(*arrays(small(1.0, 0.0, {**electronics, "sample_rate_hz": 8e4})), POSE)
+        np.asarray, plant_at(*arrays(small(1.0, 0.0, {**electronics, "sample_rate_hz": 8e4})), POSE)
     )
     rng, n_inputs = np.random.default_rng(0), slow.enter.shape[1]
     commands = rng.normal(size=(40, n_inputs))
@@ -146,16 +140,6 @@ def test_return_difference_is_that_of_the_matrices(delay):
     assert_return_difference(study, points)
 
 
-run = jax.jit(simulate, static_argnums=(0, 2))
-
-
-def voltages(study):
-    structure, case = arrays(study)
-    found = run(structure, case, True)
-    assert int(found.status) == status.OK
-    return np.asarray(found.record.actuator_voltage), structure, case
-
-
 @pytest.mark.parametrize("electronics", KINDS, ids=["plain", "amplifier, high-pass"])
 @pytest.mark.parametrize("delay", DELAYS)
 def test_run_is_that_of_the_matrices(delay, electronics):
@@ -171,14 +155,14 @@ def test_run_is_that_of_the_matrices(delay, electronics):
     )
     structure, case = arrays(study)
     structure = structure._replace(has_noise=False)
-    record = jax.tree.map(np.asarray, run(structure, case, True).record)
-    matrices = jax.jit(closed_loop, static_argnums=0)(structure, case, POSE)
+    record = jax.tree.map(np.asarray, simulated(structure, case, True).record)
+    matrices = loop_at(structure, case, POSE)
     loop = np.asarray(matrices.open + matrices.feedback)
     n = structure.n_modes
     x = np.zeros(len(loop))
     x[6 : 6 + 3 * n] = record.modal_coordinate[0].ravel()
     is_drained = "sensor_highpass_hz" in electronics
-    sensor = np.asarray(jax.jit(prepare, static_argnums=0)(structure, case).loop.sensor)
+    sensor = np.asarray(prepared(structure, case).loop.sensor)
     settled = np.einsum("ikr,ir->ik", sensor, record.modal_coordinate[0]).ravel()
     at = 6 + 6 * n + (2 * settled.size if is_drained else 0)
     x[at : at + settled.size] = settled
@@ -199,7 +183,7 @@ def test_poles_are_placed_on_the_loop_with_its_delay(law, delay):
     """The nominal loop, with the commands on their way, has the specified poles."""
     study = small(delay, 0.25, ELECTRONICS, control={"law": law, **SPECIFIED})
     structure, case = arrays(study)
-    wanted, matrices = jax.jit(nominal_loop, static_argnums=0)(structure, case)
+    wanted, matrices = nominal_of(structure, case)
     z = np.exp(np.asarray(wanted) * float(case.electronics.period))
     for link in range(3):
         for mode in range(z.shape[1]):
@@ -208,6 +192,51 @@ def test_poles_are_placed_on_the_loop_with_its_delay(law, delay):
             assert apart.min() < 1e-7
 
 
+#: Of a law that is told of limits, and a drive with memory, friction and a limit.
+ALL_PARTS = {
+    "link": {"modes": 2},
+    "control": {"law": "lqg", "modes": 1, **NOTCHES},
+    "drive": {
+        "kind": "super_twisting",
+        "coulomb_friction": 0.5,
+        "friction_speed": 0.05,
+        "ripple": 0.3,
+        "force_limit": 3.0,
+    },
+    "patches": {"gauge_gain": 800.0},
+    "metrics": {
+        "residual_delay": 0.0,
+        "residual_length": 0.004,
+        "saturation_limit": 1.0,
+        "arrival_tolerance": 1.0,
+    },
+}
+
+
+def test_kernel_equals_scan_with_all_parts_at_once():
+    """Delays, notch filters, hysteresis, gauges; each alone is long, in the files of the parts."""
+    axes = {
+        "control.notch_hz[0]": [0.0, 1500.0, 1900.0],
+        "electronics.delay": {"from": 0.0, "to": 2.0},
+        "electronics.amplifier_hz": [0.0, 2e3],
+        "electronics.voltage_limit": {"from": 0.05, "to": 0.5},
+        "patches.hysteresis": [0.0, 0.1, 0.2],
+        "patches.sensor": ["piezo", "strain_gauge"],
+        "patches.gauge_noise": [0.0, 0.01],
+    } | {
+        f"drive.kinds.super_twisting.{x.name}": {"from": 0.5 * x.default, "to": 1.5 * x.default}
+        for x in DRIVES["super_twisting"].parameters[:2]
+    }
+    sweep = {"method": "random", "count": 16, "axes": axes}
+    fast, reference = both(small_spec(sweep, **ALL_PARTS))
+    assert np.all(reference.status == status.OK)
+    assert np.max(reference.metrics.motor_saturated_fraction) > 0
+    assert np.mean(reference.metrics.saturated_fraction > 0) > 0.5
+    assert len(np.unique(reference.metrics.pose_error_peak[:, 1])) >= 16
+    check_equal(fast, reference)
+
+
+@pytest.mark.long  # in short: above
 def test_kernel_equals_scan():
     """With notch filters of the links, too."""
     axes = {
@@ -233,10 +262,9 @@ def changed(case, name, by):
 
 def assert_slope(function, step=1e-3):
     """Of a function of a delay, at 0; at whole numbers of samples it is that from below."""
-    slope = np.asarray(jax.jit(jax.jacfwd(function))(0.0))
-    function = jax.jit(function)
-    wanted = (3 * function(0.0) - 4 * function(-step) + function(-2 * step)) / (2 * step)
-    np.testing.assert_allclose(slope, wanted, rtol=1e-4)
+    both = jax.jit(lambda by: jax.jvp(function, (by,), (1.0,)))  # one program for both
+    (value, slope), once, twice = both(0.0), both(-step)[0], both(-2 * step)[0]
+    np.testing.assert_allclose(slope, (3 * value - 4 * once + twice) / (2 * step), rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -351,6 +379,7 @@ def test_a_design_is_tuned_at_its_delay():
 TINY = {"limits": {}, "starts": 1, "iterations": 3}
 
 
+@pytest.mark.long  # in short: of a controller from a file, in test_state_space
 def test_a_certificate_judges_the_loop_with_its_delay():
     study = paper_study().change(link__modes=3, electronics__delay=1.5)
     found = certify(study, sizes=(3,), bases=("pinned_pinned",), mismatches=(ModelMismatch(),))

@@ -8,16 +8,13 @@ import pytest
 
 from jaxmodel.electronics import design_amplifier, measurement_chain
 from jaxmodel.piezo import sensor_capacitance
-from jaxmodel.prepare import prepare
-from jaxmodel.sampled_loop import closed_loop
-from jaxmodel.simulate import simulate
 from studies.engine.stability import loop_report
-from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.cases import as_arrays, build_case
 from studies.study.spec import paper_study
+from tests.jaxmodel.kept import arrays, loop_at, prepared, simulated
 
 HERTZ = 2 * np.pi
 STUDY = paper_study().change(electronics__sensor_highpass_hz=24.0, electronics__amplifier_hz=800.0)
-run = jax.jit(simulate, static_argnums=(0, 2))
 MODES = HERTZ * np.array([114.4, 457.6, 1029.5])
 
 
@@ -61,7 +58,8 @@ def test_course_of_the_amplifier_has_the_moments_of_its_exponential(rate):
 
 
 RELEASED = {
-    "run__duration": 0.05,
+    "run__duration": 0.02,
+    "link__modes": 2,
     "run__smooth": True,
     "electronics__adc_bits": 32,
     "motion__waypoints": ((0.0, 0.0, np.pi / 6),),
@@ -74,20 +72,15 @@ RELEASED = {
 def released():
     """Structure, case and record after letting link 1 go."""
     study = STUDY.change(**RELEASED)
-    structure, case = build_structure(study), as_arrays(build_case(study))
-    result = run(structure, case, True)
+    structure, case = arrays(study)
+    result = simulated(structure, case, True)
     assert result.status == 0
     return structure, case, jax.tree.map(np.asarray, result.record)
 
 
-prepared = jax.jit(prepare, static_argnums=0)
-
-
 def test_run_follows_the_loop_matrix():
     structure, case, record = released()
-    look = jax.jit(closed_loop, static_argnums=0)
-    pose = np.array([0.0, 0.0, np.pi / 6])
-    matrices = look(structure._replace(n_steps=1), case, pose)
+    matrices = loop_at(structure, case, np.array([0.0, 0.0, np.pi / 6]))
     transition = np.asarray(matrices.open + matrices.feedback)
     modes = 3 * structure.n_modes
     state = np.zeros(len(transition))
@@ -115,10 +108,10 @@ def test_sensors_show_what_is_left_of_the_charge():
 def test_without_electronics_a_mixed_batch_changes_nothing():
     """Cases with corner and lag 0 among others, the links bent at the start."""
     study = paper_study().change(**RELEASED | {"run__smooth": False, "run__duration": 0.01})
-    structure, case = build_structure(study), as_arrays(build_case(study))
+    structure, case = arrays(study)
     assert not structure.has_sensor_highpass and not structure.has_amplifier
     mixed = structure._replace(has_sensor_highpass=True, has_amplifier=True)
-    alone, among = (run(one, case, True).record for one in (structure, mixed))
+    alone, among = (simulated(one, case, True).record for one in (structure, mixed))
     for name in ("modal_coordinate", "actuator_voltage", "sensor_voltage"):
         wanted = np.asarray(getattr(alone, name))
         size = np.abs(wanted).max()
@@ -138,10 +131,13 @@ def test_course_has_a_slope_by_the_lag(lag):
 def test_estimates_stay_exact_with_known_electronics():
     """The loop damps mode 1 as well with electronics that its design knows as without."""
 
+    study = STUDY.change(control__gain_factor=0.1, electronics__amplifier_hz=2000.0)
+    structure = arrays(study)[0]  # which has both, also where corner and lag are 0
+
     def damping(study):
-        structure, case = build_structure(study), as_arrays(build_case(study))
+        case = arrays(study)[1]
         return loop_report(structure, case, np.array([0.0, 0.0, np.pi / 6])).damping_ratio[0].min()
 
     plain = damping(paper_study().change(control__gain_factor=0.1))
-    known = damping(STUDY.change(control__gain_factor=0.1, electronics__amplifier_hz=2000.0))
+    known = damping(study)
     assert known == pytest.approx(plain, rel=0.1)

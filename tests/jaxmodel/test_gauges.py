@@ -8,20 +8,19 @@ import scipy.integrate
 
 from jaxmodel import status
 from jaxmodel.piezo import actuator_constant, sensor_constant
-from jaxmodel.prepare import prepare
-from jaxmodel.sampled_loop import closed_loop, sampled_plant
 from jaxmodel.simulate import simulate
 from jaxmodel.static import link_pieces, section_stiffness
 from studies.errors import StudyError
-from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.cases import as_arrays, build_case
 from studies.study.spec import paper_study, parse_study
 from studies.verify.links import check_links
+from tests.jaxmodel import kept
+from tests.jaxmodel.kept import loop_at, plant_at, prepared
 from tests.jaxmodel.test_onset import BASE, HOME
 from tests.studies.kernels.test_kernel import both, check_equal
 from tests.sweeps import small_spec
 
 POSE = np.array(HOME)
-prepared = jax.jit(prepare, static_argnums=0)
 GAUGES = {
     "sensor": "strain_gauge",
     "gauge_factor": 2.0,
@@ -32,8 +31,7 @@ GAUGES = {
 
 
 def arrays(**patches):
-    study = parse_study({**BASE, "patches": patches})
-    return build_structure(study), as_arrays(build_case(study))
+    return kept.arrays(parse_study({**BASE, "patches": patches}))
 
 
 def one_link(case):
@@ -78,9 +76,7 @@ def test_static_response_is_the_closed_form():
     """Bending between the actuator's ends alone, whatever modes are kept."""
     structure, case = arrays(**GAUGES)
     beam, patches = one_link(case)
-    plant = jax.tree.map(
-        np.asarray, jax.jit(sampled_plant, static_argnums=0)(structure, case, POSE)
-    )
+    plant = jax.tree.map(np.asarray, plant_at(structure, case, POSE))
     still = np.eye(len(plant.state)) - plant.state
     found = plant.leave @ np.linalg.solve(still, plant.enter)
     stiffness = beam.youngs_modulus * beam.width * beam.thickness**3 / 12
@@ -90,10 +86,9 @@ def test_static_response_is_the_closed_form():
 
 def test_loop_does_not_depend_on_the_kind_of_sensor():
     """Without rounding and drain: the modal filter knows what its sensors are."""
-    loop_of = jax.jit(closed_loop, static_argnums=0)
     radii = []
     for patches in ({}, GAUGES):
-        matrices = loop_of(*arrays(**patches), POSE)
+        matrices = loop_at(*arrays(**patches), POSE)
         values = np.linalg.eigvals(np.asarray(matrices.open + matrices.feedback))
         radii.append(np.sort(np.abs(values))[-40:])
     np.testing.assert_allclose(radii[1], radii[0], rtol=1e-8)
@@ -119,7 +114,7 @@ def test_noise_of_the_bridge_adds_to_that_of_the_converter():
     study = parse_study(
         {**BASE, "patches": {**GAUGES, "gauge_noise": 0.03}, "electronics": {"adc_noise": 0.004}}
     )
-    structure, case = build_structure(study), as_arrays(build_case(study))
+    structure, case = kept.arrays(study)
     assert structure.has_noise
     noise = float(prepared(structure, case).loop.controller.adc_noise)
     assert noise == pytest.approx(np.hypot(0.1 * 0.03, 0.004), rel=1e-12)
@@ -127,6 +122,7 @@ def test_noise_of_the_bridge_adds_to_that_of_the_converter():
     assert float(prepared(structure, piezo).loop.controller.adc_noise) == 0.004
 
 
+@pytest.mark.long  # in short: all operations of a loop, in test_delay
 def test_kernel_equals_scan_over_both_kinds():
     axes = {
         "patches.sensor": ["piezo", "strain_gauge"],
@@ -164,7 +160,7 @@ def test_slopes_of_a_run_are_those_of_differences():
             "patches": {**GAUGES, "gauge_noise": 0.02},
         }
     )
-    structure, case = build_structure(study), as_arrays(build_case(study))
+    structure, case = kept.arrays(study)
     structure = structure._replace(metrics=("residual_rms",))
 
     def residual(shares):

@@ -1,5 +1,6 @@
 """Gradients of the residual vibration agree with central differences, forward and reverse."""
 
+import sys
 from functools import partial
 
 import jax
@@ -9,6 +10,7 @@ import pytest
 
 import studies
 from jaxmodel.bases import find_bases
+from jaxmodel.case import Structure
 from jaxmodel.control import pole_placement
 from jaxmodel.simulate import simulate
 from studies.study.cases import as_arrays, build_case, build_structure
@@ -23,7 +25,7 @@ def objective():
     """Residual vibration [um^2] as a function of one vector of 15 numbers of order 1."""
     study = short_study(
         run__smooth=True,
-        link__modes=5,
+        link__modes=3,
         electronics__adc_noise=1e-4,
         drive__ripple=0.1,
         control__position_gain=(10.0, 10.0, 10.0),
@@ -52,11 +54,16 @@ def objective():
     return run
 
 
+STEP = 1e-4
+#: Where values are taken for central differences, and twice the point itself.
+STEPS = np.concatenate([k * STEP * np.eye(15) for k in (-2, -1, 1, 2)] + [np.zeros((2, 15))])
+
+
 @pytest.fixture(scope="module")
-def reverse(objective):
-    """Gradients of two cases at once; compiled with little optimisation, since it runs twice."""
+def valued(objective):
+    """Values and gradients of 62 cases at once; compiled with little optimisation."""
     options = {"xla_backend_optimization_level": 0}
-    return jax.jit(jax.vmap(jax.grad(objective)), compiler_options=options)
+    return jax.jit(jax.vmap(jax.value_and_grad(objective)), compiler_options=options)
 
 
 @pytest.fixture(scope="module")
@@ -65,46 +72,72 @@ def point():
 
 
 @pytest.fixture(scope="module")
-def central(objective, point):
+def found(valued, point):
+    """Values and gradients about the point."""
+    return tuple(map(np.asarray, valued(point + STEPS)))
+
+
+@pytest.fixture(scope="module")
+def central(found):
     """Central differences of fourth order, and the scale to judge by."""
-    step = 1e-4
-    steps = np.concatenate([k * step * np.eye(15) for k in (-2, -1, 1, 2)])
-    value = np.asarray(jax.jit(lambda x: jax.lax.map(objective, x, batch_size=15))(point + steps))
-    value = value.reshape(4, 15)
-    found = (value[0] - 8 * value[1] + 8 * value[2] - value[3]) / (12 * step)
+    value = found[0][:60].reshape(4, 15)
+    slope = (value[0] - 8 * value[1] + 8 * value[2] - value[3]) / (12 * STEP)
     # each kind of parameter matters, so that agreement is not of zeros
-    assert np.all(np.abs(found).reshape(5, 3).max(axis=1) > 1e-6 * np.abs(found).max())
-    return found, np.maximum(np.abs(found), 1e-3 * np.abs(found).max())
+    assert np.all(np.abs(slope).reshape(5, 3).max(axis=1) > 1e-6 * np.abs(slope).max())
+    return slope, np.maximum(np.abs(slope), 1e-3 * np.abs(slope).max())
 
 
-def test_reverse_and_central_differences_agree(reverse, central, point):
-    backward = np.asarray(reverse(np.stack([point, point])))[1]
-    found, scale = central
-    assert np.max(np.abs(backward - found) / scale) < 1e-5
+def test_reverse_and_central_differences_agree(found, central):
+    slope, scale = central
+    assert np.max(np.abs(found[1][-1] - slope) / scale) < 1e-5
 
 
 @pytest.mark.long  # in short: derivatives by the kernel are those of `jax.jvp`, in test_tangents
-def test_forward_and_reverse_agree(objective, reverse, point, central):
-    backward = np.asarray(reverse(np.stack([point, point])))[1]
-
+def test_forward_and_reverse_agree(objective, found, point, central):
     @jax.jit
     def push(x):
         return jax.vmap(lambda d: jax.jvp(objective, (x,), (d,))[1])(jnp.eye(15))
 
-    assert np.max(np.abs(backward - np.asarray(push(point))) / central[1]) < 1e-8
+    assert np.max(np.abs(found[1][-1] - np.asarray(push(point))) / central[1]) < 1e-8
 
 
-def test_bad_case_leaves_gradients_of_others_alone(reverse, point):
-    good = np.asarray(reverse(np.stack([point, point])))[0]
-    broken = point.copy()
-    broken[12:] = 40.0  # patches pushed off the link
-    after = np.asarray(reverse(np.stack([point, broken])))
-    np.testing.assert_allclose(after[0], good, rtol=1e-12)
+def test_bad_case_leaves_gradients_of_others_alone(valued, found, point):
+    points = np.tile(point, (len(STEPS), 1))
+    points[-1, 12:] = 40.0  # patches pushed off the link
+    after = np.asarray(valued(points)[1])
+    np.testing.assert_allclose(after[-2], found[1][-2], rtol=1e-12)
     # a sum over a batch that leaves it out by its status keeps the right slope
-    np.testing.assert_array_equal(after[1], 0.0)
+    np.testing.assert_array_equal(after[-1], 0.0)
 
 
-def test_a_rounded_loop_has_the_derivative_of_the_smooth_one():
+def test_a_rounded_loop_has_the_derivative_of_the_smooth_one(monkeypatch):
+    """Of runs that are replaced by powers; the long test below has real ones."""
+    asked = []
+
+    def run(structure, has_record, case):
+        asked.append(has_record)
+        return case**3 if structure.is_smooth else jnp.round(case**2)
+
+    simulation = sys.modules["jaxmodel.simulate"]  # hidden by the function of that name
+    monkeypatch.setattr(simulation, "_run", run)
+    simulation._rounded.cache_clear()
+    try:
+        ways = [
+            jax.value_and_grad(partial(simulate, Structure(is_smooth=x, feedback=feedback)))
+            for x, feedback in ((False, "sampled"), (True, "sampled"), (False, "ideal"))
+        ]
+        # rounded; smooth; without converters
+        assert [tuple(map(float, way(1.5))) for way in ways] == [(2, 6.75), (3.375, 6.75), (2, 0)]
+        assert not any(asked)
+        asked.clear()
+        simulate(Structure(), 1.5, True)
+        assert asked == [True]
+    finally:
+        simulation._rounded.cache_clear()
+
+
+@pytest.mark.long
+def test_a_rounded_run_has_the_derivative_of_the_smooth_one():
     study = parse_study(BASE)
     structure, case = build_structure(study), as_arrays(build_case(study))
 

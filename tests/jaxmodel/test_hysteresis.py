@@ -17,15 +17,15 @@ from jaxmodel.hysteresis import (
     slope_at_limit,
 )
 from jaxmodel.prepare import prepare
-from jaxmodel.sampled_loop import sampled_plant
 from jaxmodel.simulate import simulate
 from studies.engine.run_data import chord_deflection
-from studies.engine.runs import run_study
+from studies.engine.runs import Run
 from studies.errors import StudyError
-from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.margin import hysteresis_text
 from studies.study.spec import paper_study, parse_study
 from studies.twin.compare import check_supported
+from tests.jaxmodel.kept import arrays, plant_at, prepared, simulated
+from tests.jaxmodel.test_notch import NOTCHES
 from tests.jaxmodel.test_onset import BASE, HOME
 from tests.studies.kernels.test_kernel import both, check_equal
 from tests.sweeps import small_spec
@@ -85,15 +85,6 @@ def test_loop_of_a_full_cycle(width):
     assert np.ptp(up) / (2 * LIMIT) == pytest.approx(slope_at_limit(width), rel=1e-9)
 
 
-run = jax.jit(simulate, static_argnums=(0, 2))
-plant_of = jax.jit(sampled_plant, static_argnums=0)
-prepared = jax.jit(prepare, static_argnums=0)
-
-
-def arrays(study):
-    return build_structure(study), as_arrays(build_case(study))
-
-
 def small(width, limit=TINY, electronics=None, **sections):
     own = {**BASE["electronics"], "voltage_limit": limit, **(electronics or {})}
     return parse_study(
@@ -146,13 +137,13 @@ def acting_course(command, lag, share):
 def test_run_is_that_of_the_plant_behind_operators(electronics, share, within):
     """Links by a plant at eight times the rate, and the controller on what its sensors show."""
     structure, case = quiet(small(WIDTH, electronics=electronics))
-    result = run(structure, case, True)
+    result = simulated(structure, case, True)
     record = jax.tree.map(np.asarray, result.record)
     assert int(result.status) in status.FINISHED
     command = record.actuator_voltage
     assert np.abs(command).max() > 0.95 * TINY
     fast = small(0.0, electronics={"sample_rate_hz": PARTS / PERIOD})
-    plant = jax.tree.map(np.asarray, plant_of(*quiet(fast), POSE))
+    plant = jax.tree.map(np.asarray, plant_at(*quiet(fast), POSE))
     lag = float(case.electronics.amplifier_lag)
     volts = acting_course(command, lag, share).reshape(-1, PARTS, 9)
     z, n = np.zeros(len(plant.state)), 3 * structure.n_modes
@@ -168,7 +159,9 @@ def test_run_is_that_of_the_plant_behind_operators(electronics, share, within):
             z[-9:] = held
     q, found = np.array(q), record.modal_coordinate[:-1].reshape(len(q), -1)
     np.testing.assert_allclose(found, q, rtol=0, atol=within * np.abs(q).max())
-    controller = prepared(structure, case).loop.controller
+    # the same program for all electronics
+    whole = structure._replace(has_amplifier=True, has_delay=True)
+    controller = prepared(whole, case).loop.controller
 
     def sample(before, voltage):
         after, _ = controller_step(controller, before, voltage, None, True)
@@ -182,23 +175,40 @@ def test_run_is_that_of_the_plant_behind_operators(electronics, share, within):
 def test_deflection_along_the_links_is_that_of_the_run():
     """What the voltages add at mid-span, from the commands of a run that is saved."""
     electronics = {"amplifier_hz": 2e3, "delay": 1.375}
-    found = run_study(small(WIDTH, electronics=electronics), True, has_loop=False)
-    wanted = found.result.record.chord_deflection_stations
+    study = small(WIDTH, electronics=electronics)
+    structure, case = quiet(study)
+    result = jax.tree.map(np.asarray, simulated(structure, case, True))
+    found = Run(study, structure, case, result, int(result.status))
+    wanted = result.record.chord_deflection_stations
     at = found.study.metrics.stations.index(0.5)
     difference = chord_deflection(found) - wanted[:, :, at]
     assert np.abs(difference).max() < 1e-9 * np.abs(wanted).max()
 
 
+def test_without_effect_results_are_the_same():
+    """Without width, or below the least play; what a run is that has neither is tested above."""
+    structure, _ = quiet(small(WIDTH))
+    plain, wide, moving = (
+        simulated(structure, quiet(small(*numbers))[1], True)
+        for numbers in ((0.0, 1.0), (WIDTH, 1.0), (0.0, 5e-3))
+    )
+    assert PLAYS[0] * 5e-3 < float(np.max(plain.metrics.peak_voltage)) < 5e-3
+    for other in (wide, moving):
+        parts = (x._replace(record=None) for x in (other, plain))
+        for a, b in zip(*map(jax.tree.leaves, parts), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-12)
+
+
+@pytest.mark.long  # in short: above
 @pytest.mark.parametrize(
     ("width", "limit"), [(WIDTH, 1.0), (0.0, 5e-3)], ids=["below the least play", "of no width"]
 )
-def test_without_effect_results_are_the_same(width, limit):
+def test_it_is_the_same_to_have_none(width, limit):
     structure, case = quiet(small(width, limit))
     with_it, without = (
-        run(structure._replace(has_hysteresis=is_on), case) for is_on in (True, False)
+        simulated(structure._replace(has_hysteresis=is_on), case, True)._replace(record=None)
+        for is_on in (True, False)
     )
-    moves = float(np.max(without.metrics.peak_voltage)) > PLAYS[0] * limit
-    assert moves == (width == 0)
     for a, b in zip(jax.tree.leaves(with_it), jax.tree.leaves(without), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12)
 
@@ -210,6 +220,7 @@ def test_it_costs_nothing_when_off():
     assert arrays(small(WIDTH))[0].has_hysteresis
 
 
+@pytest.mark.long  # in short: all operations of a loop, in test_delay
 def test_kernel_equals_scan():
     axes = {
         "patches.hysteresis": [0.0, 0.1, 0.2],
@@ -227,21 +238,38 @@ def test_kernel_equals_scan():
 
 
 def test_slopes_of_a_run_are_those_of_differences():
-    """By the loop's width and by a gain, in a run that opens the loops."""
-    structure, case = quiet(small(0.1, 4e-3))
-    structure = structure._replace(metrics=("residual_rms",))
+    """By the loop's width, the gain, a notch filter and LQG's weights; the loops are open."""
+    control = {"law": "lqg", "modes": 2, **NOTCHES, "notch_hz": [300.0, 0.0, 2900.0]}
+    bent = {"load_deflection": (4e-6, 2e-6, -4e-6)}
+    structure, case = quiet(small(0.1, 1.0, control=control, initial=bent))
+    structure = structure._replace(metrics=("residual_rms", "peak_voltage"))
+    notch = ("notch", "notch_depth", "notch_width")
+    weights = ("voltage_weight", "disturbance", "sensor_noise", "bending_hz")
+    assert all(getattr(case.control, name)[0] > 0 for name in notch)
 
     def residual(by):
-        patches = case.machine.patches._replace(hysteresis=0.1 + by[0])
-        control = case.control._replace(gain_factor=case.control.gain_factor * (1 + by[1]))
+        """Width and gain, shares of the notch of link 1, logarithms of the weights."""
+        control, patches = case.control, case.machine.patches
+        patches = patches._replace(hysteresis=0.1 + by[0])
+        filters = {
+            name: jnp.asarray(getattr(control, name)).at[0].multiply(1 + by[k])
+            for k, name in enumerate(notch, 2)
+        }
+        own = {name: control.parameters[name] * jnp.exp(by[k]) for k, name in enumerate(weights, 5)}
+        control = control._replace(
+            gain_factor=control.gain_factor * (1 + by[1]),
+            parameters=control.parameters | own,
+            **filters,
+        )
         machine = case.machine._replace(patches=patches)
-        result = simulate(structure, case._replace(machine=machine, control=control))
-        return 1e9 * jnp.sum(result.metrics.residual_rms)
+        found = simulate(structure, case._replace(machine=machine, control=control)).metrics
+        value = 1e6 * jnp.sum(found.residual_rms)
+        return value, (value, found.peak_voltage)
 
-    slope = np.asarray(jax.jit(jax.jacfwd(residual))(np.zeros(2)))
-    function, step = jax.jit(residual), 1e-5 * np.eye(2)
-    wanted = [(function(by) - function(-by)) / 2e-5 for by in step]
-    assert np.all(np.abs(slope) > 1e-3)
+    both = jax.jit(jax.jacfwd(residual, has_aux=True))  # one program for both
+    slope, (_, peak) = both(np.zeros(9))
+    assert 0.5 < np.max(peak) < 1 and np.all(np.abs(slope) > 1e-2)
+    wanted = [(both(by)[1][0] - both(-by)[1][0]) / 6e-5 for by in 3e-5 * np.eye(9)]
     np.testing.assert_allclose(slope, wanted, rtol=1e-4)
 
 

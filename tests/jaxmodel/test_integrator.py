@@ -16,6 +16,7 @@ from jaxmodel.kinematics import inverse_kinematics
 from jaxmodel.loop import PlantState, plant_rates, plant_step
 from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import prepare
+from studies.engine.programs import kept_jit
 from studies.reference import lagrangian as reference
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import paper_study
@@ -55,11 +56,19 @@ def phi_functions(a, force):
     return full[:n, :n], *full[:n, n:].T
 
 
+def coefficients(omega, zeta, drain):
+    shaped = np.full((3, 1), omega), np.full((3, 1), zeta)
+    return jax.tree.map(np.asarray, jitted_step(*shaped, SAMPLE, CORNER, drain))
+
+
+jitted_step = jax.jit(exponential_step)
+
+
 @pytest.mark.parametrize("drain", [None, 150.0])
 @pytest.mark.parametrize("omega_h", OMEGA_H)
 def test_coefficients_equal_augmented_exponentials(omega_h, drain):
     omega, zeta = omega_h / SAMPLE, 0.01
-    found = exponential_step(np.full((3, 1), omega), np.full((3, 1), zeta), SAMPLE, CORNER, drain)
+    found = coefficients(omega, zeta, drain)
     n = found.full.shape[0]
     assert n == (4 if drain is None else 5)
     a, force, scale = (x[:n] for x in oscillator(omega, zeta, drain or 0.0))
@@ -81,7 +90,7 @@ def test_coefficients_equal_augmented_exponentials(omega_h, drain):
 @pytest.mark.parametrize("omega_h", OMEGA_H)
 def test_constant_force_is_exact_in_one_step(omega_h):
     omega, zeta = omega_h / SAMPLE, 0.05
-    found = exponential_step(np.full((3, 1), omega), np.full((3, 1), zeta), SAMPLE, CORNER)
+    found = coefficients(omega, zeta, None)
     static, q, q_rate = 1e-4, 3e-4, -2e-4 * omega  # static deflection N/omega^2
     start = np.array([q, q_rate, 0, 0])
     push = found.full_force[0] + 2 * found.full_force[1] + found.full_force[2]
@@ -142,10 +151,13 @@ def run(method, structure, loop, sample, substeps, voltages, start):
     return jax.lax.scan(one_sample, start, (jnp.arange(len(voltages)), voltages))[1]
 
 
+_prepare = kept_jit(static_argnums=0)(prepare)
+
+
 def make(**changes):
     study = STUDY.change(**changes)
     structure = build_structure(study)._replace(n_steps=1)
-    loop = jax.jit(prepare, static_argnums=0)(structure, as_arrays(build_case(study))).loop
+    loop = _prepare(structure, as_arrays(build_case(study))).loop
     zero, still = np.zeros((3, structure.n_modes)), np.zeros(3)
     return structure, loop, PlantState(np.array(HOME), still, zero, zero, zero, zero)
 
@@ -160,7 +172,8 @@ def random_voltages(n_samples):
 
 
 @pytest.mark.parametrize(
-    ("has_shortening", "volts", "substeps"), [(False, 50, 1), (True, 3, 1), (True, 50, 4)]
+    ("has_shortening", "volts", "substeps"),
+    [pytest.param(False, 50, 1, marks=pytest.mark.long), (True, 3, 1), (True, 50, 4)],
 )
 def test_few_steps_per_sample_are_as_good_as_forty_of_runge_kutta(
     eight_modes, has_shortening, volts, substeps
@@ -171,7 +184,7 @@ def test_few_steps_per_sample_are_as_good_as_forty_of_runge_kutta(
     if not has_shortening:
         structure = structure._replace(has_shortening=False)
         loop = loop._replace(plant=loop.plant._replace(shortening=None))
-    voltages = volts / 50 * random_voltages(500)
+    voltages = volts / 50 * random_voltages(100)
     fine = run("rk4", structure, loop, SAMPLE, 40, voltages, start)
     coarse = run("etdrk4", structure, loop, SAMPLE, substeps, voltages, start)
     for part in ("q", "z"):
@@ -235,6 +248,7 @@ def energy_history(free_machine, method, sample, substeps, n_samples):
     return np.asarray(energies(loop.plant, states))
 
 
+@pytest.mark.long  # in short: steps as good as those of Runge-Kutta, above
 @pytest.mark.parametrize("step", [3e-4, 6e-4])
 def test_runge_kutta_loses_the_energy_it_must(free_machine, step):
     history = energy_history(free_machine, "rk4", 10 * step, 10, 100)
@@ -243,6 +257,7 @@ def test_runge_kutta_loses_the_energy_it_must(free_machine, step):
     np.testing.assert_allclose(loss, (omega * step) ** 6 / 72, rtol=0.05)
 
 
+@pytest.mark.long  # in short: that of many modes
 @pytest.mark.parametrize("method", ["rk4", "etdrk4"])
 def test_energy_is_kept_for_a_second(free_machine, method):
     history = energy_history(free_machine, method, 1e-2, 500, 100)
@@ -252,9 +267,9 @@ def test_energy_is_kept_for_a_second(free_machine, method):
 @pytest.mark.parametrize(
     ("modes", "is_released", "step"),
     [
-        (3, True, 5e-5),
-        (8, True, 1e-5),
         (3, False, 2e-5),
+        pytest.param(3, True, 5e-5, marks=pytest.mark.long),
+        pytest.param(8, True, 1e-5, marks=pytest.mark.long),
         pytest.param(8, False, 2.5e-6, marks=pytest.mark.long),
     ],
 )

@@ -14,9 +14,11 @@ from jaxmodel.mechanisms.prrr.guides import Guides
 from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.plant import build_plant
 from studies import cli
+from studies.engine.columns import case_variables
 from studies.engine.preflight import check_run
-from studies.engine.results import metric_values, read_sweep
+from studies.engine.results import SweepData, metric_values, read_sweep
 from studies.engine.runs import run_study
+from studies.engine.stability import loop_report
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.reference import lagrangian as reference
@@ -24,6 +26,7 @@ from studies.show.figures import styled
 from studies.show.sketch import sketch, standing
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table
+from studies.store import Variable
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure
 from studies.study.paths import EACH_LINK, field_value
 from studies.study.spec import load_study, parse_study
@@ -33,6 +36,7 @@ from studies.sweeps.plots import plot
 from studies.sweeps.show import select
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import parse_tuning
+from tests import forms
 from tests.machines import random_machine
 
 SEEDS = range(10)
@@ -60,40 +64,44 @@ def states(count):
     )
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-@partial(jax.vmap, in_axes=(None, None, 0, 0, 0))
-def both_ways(kind, is_distributed, machine, motion, loads):
+@partial(jax.jit, static_argnums=0)
+@partial(jax.vmap, in_axes=(None, 0))
+def build(kind, machine):
     basis = build_basis(kind, machine.beam, machine.patches, R, jnp.array([0.1]))
-    plant = build_plant(machine, basis, False, kind != "pinned_free", is_distributed)
-    _, found = reference.closed_form(plant, motion, loads)
-    own = basis._replace(
-        shortening=plant.shortening,
-        mixed_shortening=plant.mixed_shortening,
-        inward=basis.inward if is_distributed else None,
-        centrifugal=basis.centrifugal if is_distributed else None,
-    )
-    return (found.pose, found.modal), reference.by_lagrangian(machine, own, motion, loads)
+    return basis, build_plant(machine, basis, False, kind != "pinned_free", True)
+
+
+@jax.jit
+@jax.vmap
+def by_lagrangian(machine, basis, motion, loads):
+    return reference.by_lagrangian(machine, basis, motion, loads)
 
 
 @pytest.mark.parametrize(
-    ("kind", "is_distributed"),
-    [("pinned_pinned", False), ("pinned_free", False), ("loaded", False), ("loaded", True)],
+    ("kind", "shortening"),
+    [
+        ("pinned_pinned", "lumped"),
+        ("pinned_free", "none"),
+        ("loaded", "lumped"),
+        ("loaded", "distributed"),
+    ],
 )
-def test_ten_machines_accelerate_as_their_lagrangians_say(kind, is_distributed, machines):
-    found, wanted = both_ways(kind, is_distributed, machines, *states(len(SEEDS)))
-    for mine, theirs in zip(found, wanted, strict=True):
-        axes = tuple(range(1, theirs.ndim))
-        error = np.abs(mine - theirs).max(axis=axes) / np.abs(theirs).max(axis=axes)
-        assert error.max() < 1e-10
+def test_ten_machines_accelerate_as_their_lagrangians_say(kind, shortening, machines):
+    motion, loads = states(len(SEEDS))
+    basis, plant = forms.reduced(*jax.tree.map(np.asarray, build(kind, machines)), shortening)
+    _, found = forms.closed_form(forms.lanes_last(plant), motion, loads)
+    wanted = by_lagrangian(machines, forms.general(machines, basis), motion, loads)
+    forms.check_rows((found.pose, found.modal), wanted)
 
 
 def test_a_payload_off_the_centre_matters_to_the_lagrangian(machines):
     """So that the comparison above would notice a payload that one of both leaves out."""
-    masses = machines.masses._replace(payload_offset=0 * machines.masses.payload_offset)
-    at_centre = machines._replace(masses=masses)
-    motion, loads = states(len(SEEDS))
-    (one, _), _ = both_ways("pinned_pinned", False, machines, motion, loads)
-    (other, _), _ = both_ways("pinned_pinned", False, at_centre, motion, loads)
+    _, plant = build("pinned_pinned", machines)
+    at_centre = machines.masses._replace(payload_offset=0 * machines.masses.payload_offset)
+    _, other = build("pinned_pinned", machines._replace(masses=at_centre))
+    one, other = (
+        forms.closed_form(forms.lanes_last(x), *states(len(SEEDS)))[1].pose for x in (plant, other)
+    )
     assert np.abs(one - other).max(axis=1).min() > 1e-3 * np.abs(one).max()
 
 
@@ -112,7 +120,7 @@ def sections(study):
     return tomllib.loads(study_template(study))
 
 
-@pytest.mark.long  # in short: entries of one link in a sweep, below
+@pytest.mark.long  # in short: cases of entries, below, and sweeps of others, in test_batch
 def test_a_sweep_over_machines_is_their_single_runs(tmp_path):
     """All ten in one batch: links, patches, guides, joints, payload as columns."""
     studies = [random_machine(seed, **SHORT) for seed in SEEDS]
@@ -141,24 +149,47 @@ def test_a_sweep_over_machines_is_their_single_runs(tmp_path):
         np.testing.assert_allclose(swept["gain_margin"][case], run.loop.gain_margin, rtol=0.02)
 
 
-def test_entries_of_one_number_for_all_links_are_swept(tmp_path):
-    """`link.thickness[1]` of a study that gives one: as a whole it then has no value."""
+def one_thickness():
+    """A study that gives one thickness of all links, and a sweep of two of its entries."""
     study = random_machine(0, **SHORT).change(link__thickness=2e-3)
     axes = {"link.thickness[1]": [2.0e-3, 2.2e-3], "link.thickness[0]": [2.0e-3, 2.1e-3]}
-    run_sweep(parse_sweep(sections(study) | {"sweep": {"axes": axes}}), tmp_path, is_quiet=True)
-    data = read_sweep(tmp_path)
-    same = run_study(study.change(link__thickness=(2.1e-3, 2.2e-3, 2e-3)), False, False)
-    np.testing.assert_allclose(data["residual_rms"][3], same.result.metrics.residual_rms, rtol=1e-8)
+    return study, parse_sweep(sections(study) | {"sweep": {"axes": axes}})
+
+
+def test_entries_of_one_number_for_all_links_are_swept():
+    """`link.thickness[1]` of a study that gives one: as a whole it then has no value."""
+    study, spec = one_thickness()
+    table = build_table(spec)
+    cases = build_cases(study, table.fields, build_structure(study))
+    thickness = np.broadcast_to(cases.machine.beam.thickness, (4, 3))
+    np.testing.assert_array_equal(thickness[3], [2.1e-3, 2.2e-3, 2e-3])
+    assert sorted(map(tuple, thickness)) == [
+        (2.0e-3, 2.0e-3, 2e-3),
+        (2.0e-3, 2.2e-3, 2e-3),
+        (2.1e-3, 2.0e-3, 2e-3),
+        (2.1e-3, 2.2e-3, 2e-3),
+    ]
+    ok = Variable(np.zeros(4, np.int8), ("case",), "1", "status")
+    data = SweepData(case_variables(table) | {"status": ok}, {}, spec, table)
     for ask in (
         lambda: metric_values(data, "link.thickness"),
         lambda: select(data, "link.thickness > 0.0021"),
-        lambda: plot(data, "link.thickness", "residual_rms", None),
+        lambda: plot(data, "link.thickness", "link.thickness[1]", None),
     ):
         with pytest.raises(StudyError, match=r"differs between links here; name one, such as"):
             ask()
     assert metric_values(data, "link.thickness[1]").tolist() == [2.0e-3] * 2 + [2.2e-3] * 2
     assert metric_values(data, "link.thickness[2]").tolist() == [2.0e-3] * 4
     assert "link.thickness[1]" in data.variables
+
+
+@pytest.mark.long
+def test_a_sweep_of_entries_is_its_single_runs(tmp_path):
+    study, spec = one_thickness()
+    run_sweep(spec, tmp_path, is_quiet=True)
+    data = read_sweep(tmp_path)
+    same = run_study(study.change(link__thickness=(2.1e-3, 2.2e-3, 2e-3)), False, False)
+    np.testing.assert_allclose(data["residual_rms"][3], same.result.metrics.residual_rms, rtol=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -235,8 +266,8 @@ def test_computed_torque_moves_a_payload_as_wanted(machines):
     )
 
 
-def test_a_turned_machine_is_the_same_machine():
-    """Guides and path turned by 40 deg: same bending, and links keep their numbers."""
+def turned_machines():
+    """A machine, and the same with guides and path turned by 40 deg."""
     angle, one = 40.0, random_machine(2, **SHORT)
     turn = np.radians(angle)
     alpha = tuple(a + angle for a in one.machine.guide_angles_deg)
@@ -249,12 +280,24 @@ def test_a_turned_machine_is_the_same_machine():
         for x, y, phi in one.motion.waypoints
     ]
     other = one.change(machine__guide_angles_deg=alpha, motion__waypoints=points)
-    first, second = (run_study(study, has_record=False) for study in (one, other))
-    np.testing.assert_allclose(
-        second.result.metrics.residual_rms, first.result.metrics.residual_rms, rtol=1e-6
+    return one, other
+
+
+def test_a_turned_machine_is_the_same_machine():
+    """Its loop has the same margin, and links keep their frequencies and damping."""
+    first, second = (
+        loop_report(build_structure(x), as_arrays(build_case(x)), np.array(x.motion.waypoints[0]))
+        for x in turned_machines()
     )
-    assert first.loop is not None and second.loop is not None
-    np.testing.assert_allclose(second.loop.gain_margin, first.loop.gain_margin, rtol=1e-6)
+    for name in ("gain_margin", "frequency_hz", "damping_ratio"):
+        mine, wanted = getattr(second, name), getattr(first, name)
+        np.testing.assert_allclose(mine, wanted, rtol=1e-6, err_msg=name)
+
+
+@pytest.mark.long
+def test_a_turned_machine_bends_alike():
+    first, second = (run_study(x, False, False).result.metrics for x in turned_machines())
+    np.testing.assert_allclose(second.residual_rms, first.residual_rms, rtol=1e-6)
 
 
 #: Link length that makes all links point at the centre of the platform where its joints do [m].
@@ -285,18 +328,24 @@ def test_a_machine_that_cannot_be_built_is_refused(change, words):
 
 def test_links_in_line_with_one_point_hold_nothing():
     """`hold` is 1 where forces pull at right angles, and 0 where all links point at the centre."""
-    plant = build_plant_of(parse_study({}))
-    chain = kinematics.close_chain(plant, jnp.array(HOME), jnp.zeros(3))
-    assert 0.5 < float(kinematics.hold(chain)) <= 1
+    plant, hold = build_plant_of(parse_study({})), jax.jit(kinematics.hold)
+    chain = close(plant, np.array(HOME))
+    assert 0.5 < float(hold(chain)) <= 1
     cx, cy = plant.length * chain.frame.x, plant.length * chain.frame.y
-    assert float(kinematics.hold(chain._replace(cx=cx, cy=cy))) < 1e-12
+    assert float(hold(chain._replace(cx=cx, cy=cy))) < 1e-12
+
+
+@jax.jit
+def close(plant, pose):
+    return kinematics.close_chain(plant, pose, jnp.zeros(3))
 
 
 def build_plant_of(study):
     """Plant of a study's machine."""
     machine = as_arrays(build_case(study)).machine
-    basis = build_basis("pinned_pinned", machine.beam, machine.patches, R, jnp.array([0.1]))
-    return build_plant(machine, basis)
+    made = build("pinned_pinned", jax.tree.map(lambda x: np.asarray(x)[None], machine))[1]
+    plant = jax.tree.map(lambda x: np.asarray(x)[0], made)
+    return plant._replace(inward=None, centrifugal=None)
 
 
 def test_a_sketch_stands_where_the_machine_does():
@@ -304,7 +353,7 @@ def test_a_sketch_stands_where_the_machine_does():
     pose = np.array(study.motion.waypoints[0])
     slider, joint = standing(study, pose)
     plant = build_plant_of(study)
-    chain = kinematics.close_chain(plant, jnp.array(pose), jnp.zeros(3))
+    chain = close(plant, pose)
     guide = plant.legs
     u = np.stack([guide.ux, guide.uy], axis=1)
     n = np.stack([-u[:, 1], u[:, 0]], axis=1)

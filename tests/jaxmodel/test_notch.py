@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from jaxmodel.nominal_loop import nominal_loop
 from jaxmodel.notch import advance_notch, design_notch, notch_response
-from jaxmodel.sampled_loop import closed_loop
 from jaxmodel.simulate import simulate
 from studies.engine.controller import check_codable
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
-from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.cases import build_structure
 from studies.study.spec import paper_study, parse_study
+from tests.jaxmodel import kept
+from tests.jaxmodel.kept import loop_at, nominal_of
 from tests.jaxmodel.test_onset import BASE, HOME, onset_is_at_the_margin
 
 POSE, PERIOD = np.array(HOME), 1e-4
@@ -27,7 +27,7 @@ NOTCHES = {
 
 def arrays(**control):
     study = parse_study({**BASE, "link": {"modes": 2}, "control": {**NOTCHES, **control}})
-    return build_structure(study), as_arrays(build_case(study))
+    return kept.arrays(study)
 
 
 def by_scipy(hertz, depth, width):
@@ -67,10 +67,12 @@ def test_samples_are_scipys():
 def test_matrices_have_the_loop_through_the_filter():
     """The same notch on all links is a factor of every path: det of both by SciPy's response."""
     same = {"notch_hz": [1830.0] * 3, "notch_depth": [0.1] * 3, "notch_width": [0.3] * 3}
-    loop_of = jax.jit(closed_loop, static_argnums=0)
+    structure, case = arrays(**same)
+    assert structure.has_notch
+    without = case.control._replace(notch=np.zeros(3))
     filtered, plain = (
-        jax.tree.map(np.asarray, loop_of(*arrays(**control), POSE))
-        for control in (same, {"notch_hz": [0.0] * 3})
+        jax.tree.map(np.asarray, loop_at(structure, case._replace(control=control), POSE))
+        for control in (case.control, without)
     )
 
     def ratio(loop, z, factor):
@@ -89,7 +91,7 @@ def test_matrices_have_the_loop_through_the_filter():
 @pytest.mark.parametrize("k_p", [0.0, 100.0])
 def test_poles_are_placed_behind_the_filter(k_p):
     structure, case = arrays(pole_decay=150.0, pole_frequency_hz=[[110.0 + k_p / 50]] * 3)
-    wanted, matrices = jax.jit(nominal_loop, static_argnums=0)(structure, case)
+    wanted, matrices = nominal_of(structure, case)
     z = np.exp(np.asarray(wanted) * PERIOD)
     for link, mode in np.ndindex(*z.shape):
         poles = np.linalg.eigvals(matrices[link, mode])
@@ -102,12 +104,12 @@ def test_a_run_grows_beyond_the_margin_behind_a_filter():
     onset_is_at_the_margin(study)
     plain = parse_study(BASE)
     with_it, without = (
-        loop_report(build_structure(x), as_arrays(build_case(x)), POSE, n_modes=4).gain_margin
-        for x in (study, plain)
+        loop_report(*kept.arrays(x), POSE, n_modes=4).gain_margin for x in (study, plain)
     )
     assert abs(with_it / without - 1) > 0.01
 
 
+@pytest.mark.long  # in short: among all parts of a run, in test_hysteresis
 def test_slopes_of_a_run_are_those_of_differences():
     """Of residual vibration, by frequency, depth and width of a link's filter."""
     study = parse_study(
@@ -119,7 +121,7 @@ def test_slopes_of_a_run_are_those_of_differences():
             "control": {**NOTCHES, "notch_hz": [300.0, 0.0, 2900.0]},
         }
     )
-    structure, case = build_structure(study), as_arrays(build_case(study))
+    structure, case = kept.arrays(study)
     structure = structure._replace(has_noise=False, metrics=("residual_rms",))
     names = ("notch", "notch_depth", "notch_width")
     sizes = np.array([case.control._asdict()[name][0] for name in names])

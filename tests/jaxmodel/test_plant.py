@@ -2,24 +2,27 @@
 
 import json
 
+import jax
 import numpy as np
 import pytest
 from scipy.io import loadmat
 
 from jaxmodel.frequency_response import controller_response
 from jaxmodel.mechanisms.prrr.paper import HOME
-from jaxmodel.prepare import prepare
-from studies.engine.preflight import check_run
-from studies.engine.runs import run_study
+from studies.engine.preflight import check_run, preflight
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
+from studies.export.in_the_loop import replay
 from studies.single.plant import controller_of, plant_of, write_system
-from studies.study.cases import as_arrays
 from studies.study.spec import parse_study
+from studies.study.template import study_template
 from tests.jaxmodel.test_state_space import PERIOD, SHORT, study_with, thirty  # noqa: F401
 from tests.studies.test_cli import refused, run
 
-ELECTRONICS = [{}, {"amplifier_hz": 2_000.0, "sensor_highpass_hz": 5.0}]
+ELECTRONICS = [
+    pytest.param({}, marks=pytest.mark.long),
+    {"amplifier_hz": 2_000.0, "sensor_highpass_hz": 5.0},
+]
 
 
 def closed(plant, matrices):
@@ -87,14 +90,20 @@ def test_files_hold_the_same(tmp_path, end):
 
 
 def test_the_command(tmp_path, capsys):
-    code, out, _ = run(capsys, "plant", "paper", "--out", tmp_path / "plant.npz")
-    assert code == 0 and "81 states, 9 actuators to 9 sensors, 100 µs a sample" in out
+    (tmp_path / "study.toml").write_text(study_template(parse_study(SHORT)))
+    code, out, _ = run(capsys, "plant", tmp_path / "study.toml", "--out", tmp_path / "plant.npz")
+    # pose, three modes of three links, filters of nine sensors and held commands
+    text = f"{6 + 2 * 9 + 2 * 9 + 9} states, 9 actuators to 9 sensors, 100 µs a sample"
+    assert code == 0 and text in out
     said = refused(capsys, "plant", "paper", "--out", tmp_path / "plant.csv")
     assert "--out" in said and ".json, .npz, .mat" in said
     said = refused(capsys, "plant", "paper", "--out", tmp_path / "none" / "plant.npz")
     assert "cannot write there" in said and "create it first" in said
     with pytest.raises(StudyError, match="control.feedback = 'none'; allowed: 'sampled'"):
         plant_of(parse_study(SHORT | {"control": {"feedback": "none"}}))
+
+
+_response = jax.jit(controller_response)
 
 
 @pytest.mark.parametrize(
@@ -104,10 +113,10 @@ def test_a_controller_is_the_same_system_in_either_form(control):
     study = parse_study(SHORT | {"control": control})
     system = controller_of(study)
     structure, case = check_run(study)
-    controller = prepare(structure, as_arrays(case)).loop.controller
+    controller = preflight(structure, case).controller
     for z in np.exp(2j * np.pi * PERIOD * np.array([20.0, 114.0, 460.0, 3000.0])):
         states = np.linalg.solve(z * np.eye(len(system.a)) - system.a, system.b + 0j)
-        wanted = controller_response(controller, z)
+        wanted = _response(controller, z)
         np.testing.assert_allclose(system.c @ states + system.d, wanted, rtol=1e-9, atol=1e-9)
 
 
@@ -115,8 +124,11 @@ def test_a_controller_comes_back_from_its_file(tmp_path):
     study = parse_study(SHORT)
     write_system(controller_of(study), tmp_path / "imsc.npz")
     again = study_with(tmp_path / "imsc.npz")
-    first, second = (run_study(x).result.metrics.residual_rms for x in (study, again))
-    np.testing.assert_allclose(second, first, rtol=1e-6)
+    first, second = (preflight(*check_run(x)).controller for x in (study, again))
+    codes = np.random.default_rng(1).integers(1500, 2500, (300, 3, 3)).astype(float)
+    wanted = np.asarray(replay(first, codes))
+    assert 1 < np.abs(wanted).max() < float(first.voltage_limit)
+    np.testing.assert_allclose(replay(second, codes), wanted, atol=1e-9 * np.abs(wanted).max())
 
 
 def test_a_law_that_switches_is_no_linear_system():

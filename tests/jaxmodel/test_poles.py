@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from jaxmodel.bases import find_bases
-from jaxmodel.case import Case, Structure
+from jaxmodel.case import Case
 from jaxmodel.laws.contract import acting_channels
 from jaxmodel.laws.poles import _is_flat
-from jaxmodel.nominal_loop import nominal_loop
-from jaxmodel.prepare import design_controller, prepare
+from jaxmodel.prepare import design_controller
 from jaxmodel.status import OK, UNPLACEABLE
 from studies.engine.controller import fixed_controller
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
@@ -26,13 +24,13 @@ from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table, case_study
-from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.cases import as_arrays, build_case
 from studies.study.spec import Study, parse_study
+from tests.jaxmodel.kept import bases_of, design_of, nominal_of, prepared
+from tests.jaxmodel.kept import without_run as arrays
 
-_nominal = jax.jit(nominal_loop, static_argnums=0)
-_prepared = jax.jit(prepare, static_argnums=0)
-#: Sets of poles.
-N = 200
+#: Of links whose laws have a model.
+DRAINED = {"amplifier_hz": 3_000.0, "sensor_highpass_hz": 5.0}
 #: Added damping ratios by mode.
 BY_MODE = [[0.2, 0.03, 0.01], [0.15, 0.02, 0.005], [0.1, 0.0, 0.02]]
 
@@ -40,11 +38,6 @@ BY_MODE = [[0.2, 0.03, 0.01], [0.15, 0.02, 0.005], [0.1, 0.0, 0.02]]
 def study_with(law: str = "imsc", decay: object = 100.0, **changes: object) -> Study:
     control = {"law": law, "pole_decay": decay} | changes.pop("control", {})
     return parse_study({"control": control, "link": {"modes": 3}} | changes)
-
-
-def arrays(study: Study) -> tuple[Structure, Case]:
-    """Without a run, whose length would make programs differ."""
-    return build_structure(study)._replace(n_steps=1), as_arrays(build_case(study))
 
 
 def nearest_poles(asked: np.ndarray, matrix: np.ndarray, period: float) -> np.ndarray:
@@ -65,6 +58,7 @@ def random_poles(case: Case, rng: np.random.Generator, omega: np.ndarray) -> Cas
     return case._replace(control=case.control._replace(pole_decay=decay, pole_frequency=frequency))
 
 
+@pytest.mark.parametrize("n_sets", [30, pytest.param(200, marks=pytest.mark.long)])
 @pytest.mark.parametrize(
     ("law", "changes"),
     [
@@ -76,39 +70,37 @@ def random_poles(case: Case, rng: np.random.Generator, omega: np.ndarray) -> Cas
                 "control": {"feedthrough_factor": 0.6},
             },
         ),
-        ("observer", {"electronics": {"amplifier_hz": 3000.0}}),
+        ("observer", {"electronics": DRAINED}),
     ],
 )
-def test_random_poles_are_obtained_on_the_nominal_link(law, changes):
-    """200 sets of nine, to 1e-9 of their size."""
+def test_random_poles_are_obtained_on_the_nominal_link(law, changes, n_sets):
+    """Sets of nine, to 1e-9 of their size."""
     study = study_with(law, **changes)
     structure, case = arrays(study)
-    omega = np.asarray(_omega(structure, case))
+    omega = _omega(structure, case)
     rng = np.random.default_rng(1)
     worst = 0.0
-    for _ in range(N):
-        asked, matrix = map(np.asarray, _nominal(structure, random_poles(case, rng, omega)))
+    for _ in range(n_sets):
+        asked, matrix = map(np.asarray, nominal_of(structure, random_poles(case, rng, omega)))
         found = nearest_poles(asked, matrix, float(case.electronics.period))
         worst = max(worst, np.max(np.abs(found - asked) / np.abs(asked)))
     assert worst < 1e-9
 
 
-@partial(jax.jit, static_argnums=0)
 def _omega(structure, case):
-    return find_bases(structure, case).believed_omega
+    return np.asarray(bases_of(structure, case).believed_omega)
 
 
-@partial(jax.jit, static_argnums=0)
 def _gains(structure, case):
-    law = design_controller(structure, case, find_bases(structure, case)).controller.feedback
-    return law.velocity_gain, law.position_gain
+    law = design_of(structure, case).controller.feedback
+    return np.asarray(law.velocity_gain), np.asarray(law.position_gain)
 
 
 def test_gains_agree_with_an_independent_loop():
     """Mode, filter, hold, delay and estimates by SciPy's exponential and polynomials, to 1e-8."""
     study = study_with(decay=[[150.0, 80.0, 90.0], [100.0, 70.0, 80.0], [60.0, 90.0, 200.0]])
     structure, case = arrays(study)
-    design = _design(structure, case)
+    design = design_of(structure, case)
     law, nominal = jax.tree.map(np.asarray, (design.controller.feedback, design.nominal))
     period, corner = float(case.electronics.period), float(case.electronics.antialias)
     static = nominal.observer @ nominal.feedthrough @ nominal.synthesizer
@@ -144,11 +136,6 @@ def test_gains_agree_with_an_independent_loop():
         assert np.abs(poles - wanted).min() < 1e-8
 
 
-@partial(jax.jit, static_argnums=0)
-def _design(structure, case):
-    return design_controller(structure, case, find_bases(structure, case))
-
-
 def _numerator(law, i, j):
     velocity = np.array([n[i, j] for n in law.estimator.velocity])
     position = np.array([n[i, j] for n in law.estimator.position])
@@ -161,8 +148,8 @@ def test_modes_without_a_decay_follow_the_ratios():
     decay = [[150.0], [100.0, 77.0], [60.0]]
     study = study_with(decay=decay, control={"ratios": ratios})
     structure, case = arrays(study)
-    asked, matrix = map(np.asarray, _nominal(structure, case))
-    omega = np.asarray(_omega(structure, case))
+    asked, matrix = map(np.asarray, nominal_of(structure, case))
+    omega = _omega(structure, case)
     first = np.array([150.0, 100.0, 60.0])[:, None] - 0.01 * omega[:, :1]
     wanted = 0.01 * omega + np.array(ratios) * first
     wanted[1, 1] = 77.0
@@ -170,7 +157,7 @@ def test_modes_without_a_decay_follow_the_ratios():
     np.testing.assert_allclose(np.abs(asked), omega, rtol=1e-12)
     found = nearest_poles(asked, matrix, float(case.electronics.period))
     np.testing.assert_allclose(found, asked, rtol=1e-9)
-    velocity, position = map(np.asarray, _gains(structure, case))
+    velocity, position = _gains(structure, case)
     assert velocity[0, 2] == position[0, 2] == velocity[2, 1] == 0.0
     assert np.all(velocity[[0, 1, 1, 2], [1, 1, 2, 2]] != 0)
 
@@ -180,8 +167,8 @@ def test_continuous_feedback_has_the_gains_of_the_paper():
     control = {"feedback": "ideal", "pole_frequency_hz": [[120.0, 0.0], [0.0, 470.0], [125.0]]}
     study = study_with(decay=90.0, control=control)
     structure, case = arrays(study)
-    omega = np.asarray(_omega(structure, case))
-    velocity, position = map(np.asarray, _gains(structure, case))
+    omega = _omega(structure, case)
+    velocity, position = _gains(structure, case)
     mass = study.link.density * study.link.width * study.link.thickness * study.link.length / 2
     beta = np.sqrt(omega**2 - 90.0**2)
     for at, hertz in (((0, 0), 120.0), ((1, 1), 470.0), ((2, 0), 125.0)):
@@ -195,20 +182,24 @@ def test_gains_are_differentiable():
     """By decays and frequencies, forward against differences, 1e-6."""
     study = study_with(decay=[[150.0, 80.0, 90.0]] * 3)
     structure, case = arrays(study)
-    omega = _omega(structure, case)
+    bases = bases_of(structure, case)
+    omega = bases.believed_omega
 
     def gains(x):
         control = case.control._replace(
             pole_decay=case.control.pole_decay * jnp.exp(x[0]),
             pole_frequency=omega * jnp.exp(x[1]),
         )
-        return jnp.stack(_gains(structure, case._replace(control=control)))
+        changed = case._replace(control=control)
+        law = design_controller(structure, changed, bases).controller.feedback
+        found = jnp.stack([law.velocity_gain, law.position_gain])
+        return found, found
 
-    run, h = jax.jit(gains), 1e-5
-    slope = jax.jit(jax.jacfwd(gains))(np.zeros(2))
+    both, h = jax.jit(jax.jacfwd(gains, has_aux=True)), 1e-5  # one program for both
+    slope = both(np.zeros(2))[0]
     for k in range(2):
         step = h * np.eye(2)[k]
-        wanted = (run(step) - run(-step)) / (2 * h)
+        wanted = (both(step)[1] - both(-step)[1]) / (2 * h)
         scale = np.abs(wanted).max()
         np.testing.assert_allclose(slope[..., k], wanted, rtol=1e-6, atol=1e-7 * scale)
 
@@ -217,9 +208,10 @@ def test_gains_are_differentiable():
     ("law", "changes", "code"),
     [
         ("imsc", {"pole_decay": 100.0}, OK),
-        ("observer", {"pole_decay": 700.0}, OK),
+        # whatever the law, by the same function
+        pytest.param("observer", {"pole_decay": 700.0}, OK, marks=pytest.mark.long),
         ("imsc", {"pole_decay": 800.0}, UNPLACEABLE),  # mode 1 vibrates at 719 rad/s
-        ("observer", {"pole_decay": 800.0}, UNPLACEABLE),
+        pytest.param("observer", {"pole_decay": 800.0}, UNPLACEABLE, marks=pytest.mark.long),
         ("imsc", {"pole_decay": 800.0, "mode_mask": [[False, True, True]] * 3}, OK),
         ("imsc", {"pole_decay": 50.0, "pole_frequency_hz": [[5e3]] * 3}, UNPLACEABLE),
         ("imsc", {"pole_decay": 800.0, "pole_frequency_hz": [[1e-4]] * 3}, UNPLACEABLE),  # in phase
@@ -227,9 +219,9 @@ def test_gains_are_differentiable():
     ],
 )
 def test_what_cannot_be_placed_is_a_status(law, changes, code):
-    study = study_with(law, control=changes)
+    study = study_with(law, control=changes, electronics=DRAINED if law == "observer" else {})
     structure, case = arrays(study)
-    found = _prepared(structure, case)
+    found = prepared(structure, case)
     assert int(found.status) == code
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(found.loop.controller.feedback))
 
@@ -272,12 +264,14 @@ def test_poles_that_make_no_sense_are_refused(control, message):
 @pytest.mark.parametrize("rate", [4_500.0, 10_000.0, 40_000.0])
 def test_the_observers_loop_has_the_poles_of_continuous_feedback(rate):
     """From the study's gains, at any sample rate, on the model of the link."""
-    electronics = {"sample_rate_hz": rate, "antialias_hz": 1_500.0, "amplifier_hz": 3_000.0}
+    electronics = {"sample_rate_hz": rate, "antialias_hz": 1_500.0} | DRAINED
     gains = {"velocity_gain": (1.0, 2.0, 3.0), "position_gain": (0.0, 200.0, -300.0)}
-    study = parse_study({"control": {"law": "observer"} | gains, "electronics": electronics})
+    study = study_with("observer", [], control=gains, electronics=electronics)
     structure, case = arrays(study)
-    _, matrix = map(np.asarray, _nominal(structure, case))
-    nominal = jax.tree.map(np.asarray, _design(structure, case).nominal)
+    assert not structure.has_poles
+    structure = structure._replace(has_poles=True)  # as a case among others that have some
+    _, matrix = map(np.asarray, nominal_of(structure, case))
+    nominal = jax.tree.map(np.asarray, design_of(structure, case).nominal)
     ratio = np.array(study.control.ratios)
     velocity = np.array(gains["velocity_gain"])[:, None] * ratio / nominal.modal_mass
     position = np.array(gains["position_gain"])[:, None] * ratio / nominal.modal_mass
@@ -299,18 +293,28 @@ OWN_LINKS = {
 }
 
 
-def test_added_damping_is_obtained_on_any_machine():
+@pytest.mark.parametrize(
+    ("machine", "dampings"),
+    [
+        (OWN_LINKS, [0.2, BY_MODE]),
+        # a payload without mass: the default machine
+        pytest.param(
+            {"load": {"mass": 0.0, "offset": [0.01, 0.005]}}, [0.2], marks=pytest.mark.long
+        ),
+    ],
+    ids=["links", "default"],
+)
+def test_added_damping_is_obtained_on_any_machine(machine, dampings):
     """0.2 of mode 1, others by (24): to 1e-9 on the nominal link, 5 % assembled, margin > 2.
 
     Natural frequencies are kept. By mode, each gets its own.
     """
-    payload = {"load": {"mass": 0.0, "offset": [0.01, 0.005]}}  # massless: the default machine
     ratio = np.array(Study().control.ratios)
-    for machine, damping in ((payload, 0.2), (OWN_LINKS, 0.2), (OWN_LINKS, BY_MODE)):
+    for damping in dampings:
         link = machine.get("link", {}) | {"modes": 3}
         study = parse_study({**machine, "link": link, "control": {"damping": damping}})
         structure, case = arrays(study)
-        asked, matrix = map(np.asarray, _nominal(structure, case))
+        asked, matrix = map(np.asarray, nominal_of(structure, case))
         found = nearest_poles(asked, matrix, float(case.electronics.period))
         omega = _omega(structure, case)
         added = 0.2 * ratio * omega[:, :1] / omega if damping == 0.2 else np.array(damping)
@@ -331,7 +335,7 @@ def test_added_damping_leaves_modes_alone_where_it_is_none():
         }
     )
     structure, case = arrays(study)
-    found = _prepared(structure, case)
+    found = prepared(structure, case)
     assert int(found.status) == OK
     is_on = np.asarray(found.loop.controller.feedback.velocity_gain) != 0
     np.testing.assert_array_equal(is_on, [[True, False, True], [False] * 3, [True, True, False]])
@@ -371,33 +375,81 @@ def test_decays_and_damping_ratios_are_shown_in_their_units():
 @pytest.mark.parametrize(
     ("law", "electronics"),
     [
-        ("imsc", {"amplifier_hz": 2_000.0, "sensor_highpass_hz": 5.0}),
-        ("observer", {"amplifier_hz": 2_000.0}),
-        ("observer", {"sensor_highpass_hz": 5.0}),
+        ("observer", DRAINED),
+        pytest.param("imsc", DRAINED, marks=pytest.mark.long),
+        pytest.param("observer", {"amplifier_hz": 2_000.0}, marks=pytest.mark.long),
+        pytest.param("observer", {"sensor_highpass_hz": 5.0}, marks=pytest.mark.long),
     ],
 )
 def test_exports_and_certificates_get_the_controller_that_runs(law, electronics):
     """With poles, amplifiers and drained patches, which are part of the design."""
     study = study_with(law, [160.0, 120.0, 90.0], electronics=electronics)
     structure, case = arrays(study)
-    runs = _design(structure, case).controller
+    runs = design_of(structure, case).controller
     exported = fixed_controller(study).controller
     near = partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-12)
     jax.tree.map(near, exported.feedback, runs.feedback)
 
 
+#: Modes without a gain, where the law's model has more damping than the links.
+FIRST_ALONE = {
+    "law": "observer",
+    "decay": [[160.0]] * 3,
+    "link": {"modes": 3, "damping_ratio": 0.001},
+    "control": {"ratios": [[1.0, 0, 0]] * 3},
+    "electronics": DRAINED,
+}
+
+
+def test_observers_give_modes_no_gain_whatever_the_links_damping():
+    """A ratio of 0 is no gain: commands of a link are those of mode 1's force alone."""
+    design = jax.tree.map(np.asarray, design_of(*arrays(study_with(**FIRST_ALONE))))
+    feedback = design.controller.feedback
+    for link in range(3):
+        every = [feedback.direct[link], feedback.leave[link].reshape(3, -1)]
+        for part in every:
+            left, size, _ = np.linalg.svd(part)
+            assert size[0] > 0 and size[1] < 1e-10 * size[0]
+            first = design.nominal.synthesizer[link][:, 0]
+            assert abs(left[:, 0] @ first) == pytest.approx(np.linalg.norm(first), rel=1e-10)
+
+
+@pytest.mark.long  # in short: above
 def test_observers_leave_modes_alone_whatever_the_links_damping():
-    """A ratio of 0 is no gain, where the law's model has more damping than the links."""
-    link = {"modes": 3, "damping_ratio": 0.001}
-    study = study_with("observer", [[160.0]] * 3, link=link, control={"ratios": [[1.0, 0, 0]] * 3})
+    study = study_with(**FIRST_ALONE)
     structure, case = arrays(study)
     report = loop_report(structure, case, np.array(study.motion.waypoints[0]))
     assert report.is_stable and report.gain_margin > 2
     assert np.all((report.damping_ratio[1:] > 0.0009) & (report.damping_ratio[1:] < 0.0015))
 
 
-def test_poles_are_axes_of_a_sweep(tmp_path):
-    """One number, lists by mode and entries of them; each case is the run of its own study."""
+#: Decays of a sweep, and how many modes are controlled.
+DECAYS = {
+    "control.pole_decay": [50.0, 200.0, [[150.0, 80.0], [100.0], [60.0]]],
+    "control.modes": [2, 3],
+}
+
+
+def test_poles_are_axes_of_a_sweep():
+    """One number, lists by mode and entries of them; each case has the gains of its own study."""
+    table = build_table(parse_sweep({"link": {"modes": 3}, "sweep": {"axes": DECAYS}}))
+    (group,) = plan_groups(table, np.arange(6), local_layout)
+    assert group.structure.has_poles and group.structure.n_controlled == 3
+    together = group.structure._replace(n_steps=1)
+    for k in range(6):
+        case = jax.tree.map(lambda x: np.asarray(x)[0], chunk_cases(table, [k], together, 1))
+        study = case_study(table, k)
+        for found, alone in zip(_gains(together, case), _gains(*arrays(study)), strict=True):
+            n = alone.shape[1]
+            assert n == study.control.modes and np.any(alone != 0)
+            np.testing.assert_allclose(found[:, :n], alone, rtol=1e-9)
+            assert not np.any(found[:, n:])
+    assert len(table) == 6
+
+
+@pytest.mark.long  # in short: above
+def test_runs_of_a_sweep_over_poles(tmp_path):
+    """Each case is the run of its own study."""
     short = {
         "run": {"duration": 0.04},
         "link": {"modes": 3},
@@ -406,9 +458,7 @@ def test_poles_are_axes_of_a_sweep(tmp_path):
         "drive": {"pulse_force": [20.0, -10.0, 15.0], "pulse_length": 0.0005},
         "metrics": {"residual_delay": 0.003, "residual_length": 0.03},
     }
-    by_mode = [[150.0, 80.0], [100.0], [60.0]]
-    axes = {"control.pole_decay": [50.0, 200.0, by_mode], "control.modes": [2, 3]}
-    spec = parse_sweep({**short, "sweep": {"axes": axes}})
+    spec = parse_sweep({**short, "sweep": {"axes": DECAYS}})
     run_sweep(spec, tmp_path / "sweep", is_quiet=True)
     found = read_sweep(tmp_path / "sweep")
     table, rms = found.table, found["residual_modal_rms"]

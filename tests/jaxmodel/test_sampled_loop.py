@@ -19,7 +19,8 @@ from jaxmodel.sampled_loop import (
     spillover,
     summed_squares,
 )
-from jaxmodel.simulate import simulate
+from studies.engine.programs import kept_jit
+from studies.engine.runs import _simulate
 from studies.engine.stability import gain_margin, loop_report
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.margin import LOWEST
@@ -58,9 +59,7 @@ def arrays(**changes):
     return build_structure(study)._replace(n_steps=1), as_arrays(build_case(study))
 
 
-@partial(jax.jit, static_argnums=0)
-def prepared(structure, case):
-    return prepare(structure, case)
+prepared = kept_jit(static_argnums=0)(prepare)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -69,8 +68,9 @@ def linear_plant(structure, case):
     return linearise(structure, loop, HOME_POSE)
 
 
-loop_matrices = jax.jit(closed_loop, static_argnums=0)
-lengthening = jax.jit(spillover, static_argnums=0)
+loop_matrices = kept_jit(static_argnums=0)(closed_loop)
+lengthening = kept_jit(static_argnums=0)(spillover)
+slowest = jax.jit(slowest_decay)
 
 
 @pytest.fixture(scope="module")
@@ -100,6 +100,7 @@ def test_table_of_designs(reports, name):
     np.testing.assert_allclose(report.damping_ratio.min(axis=1), damping, atol=2e-3)
 
 
+@pytest.mark.long  # in short: with eight, and with three in test_static
 @pytest.mark.parametrize("name", TABLE)
 def test_margins_with_twelve_plant_modes(name):
     changes, (_, margin), _ = TABLE[name]
@@ -251,8 +252,10 @@ def at_home(**changes):
     return build_structure(study), as_arrays(build_case(study))
 
 
-def recorded(structure, case):
-    return jax.jit(simulate, static_argnums=(0, 2))(structure, case, True).record
+def run(structure, case):
+    """A run with its record and few metrics: what nobody asks for takes time to compile."""
+    few = structure._replace(metrics=("residual_rms",), n_frequencies=1)
+    return _simulate(few, case, True)
 
 
 def test_ideal_feedback_of_a_run_is_its_gains_times_rates():
@@ -264,7 +267,7 @@ def test_ideal_feedback_of_a_run_is_its_gains_times_rates():
         control__velocity_gain=(1.0, 0.5, 0.7),
         initial__modal=((1e-4, 2e-5), (), (-1e-4, 0.0)),
     )
-    record = recorded(structure, case)
+    record = run(structure, case).record
     on_rate = np.asarray(prepared(structure, case).loop.ideal[0])
     path = scipy.interpolate.CubicSpline(record.time, record.modal_coordinate)
     wanted = np.einsum("ikr,nir->nik", on_rate, path(record.time, 1))
@@ -283,7 +286,7 @@ def test_what_rests_stays_at_rest():
         electronics__delay=1.5,
         run__smooth=True,
     )
-    record = recorded(structure._replace(has_noise=False), case)
+    record = run(structure._replace(has_noise=False), case).record
     for name in ("sensor_voltage", "actuator_voltage", "modal_coordinate", "pose_error"):
         np.testing.assert_allclose(getattr(record, name), 0.0, rtol=0, atol=1e-12, err_msg=name)
 
@@ -319,22 +322,24 @@ def test_leakage_into_the_first_pinned_free_mode():
 # --- against the nonlinear run --------------------------------------------------------------------
 
 SMALL = 1e-7  # initial modal displacement [m]: linear to about one part in 10^5
-RELEASED = {
-    "run__duration": 0.05,
+#: Runs that share a program.
+LINEAR = {
+    "run__duration": 0.15,
     "run__smooth": True,
     "electronics__adc_bits": 32,
-    "motion__waypoints": ((0.0, 0.0, HOME[2]),),
+    "motion__move_time": 0.03,
     "shaper__kind": "none",
-    "initial__modal": ((SMALL,), (), ()),
+    "metrics__residual_delay": 0.02,
+    "metrics__residual_length": 0.09,
 }
-run = jax.jit(simulate, static_argnums=(0, 2))
+RELEASED = {"motion__waypoints": (HOME, HOME), "initial__modal": ((SMALL,), (), ())}
 
 
 def released(**changes):
     """Structure, case and modal coordinates (n_steps, 3, R) after letting link 1 go."""
-    study = STUDY.change(**RELEASED, **changes)
+    study = STUDY.change(**LINEAR, **RELEASED, **changes)
     structure, case = build_structure(study), as_arrays(build_case(study))
-    result = run(structure, case, True)
+    result = run(structure, case)
     assert result.status == 0
     return structure, case, np.asarray(result.record.modal_coordinate)
 
@@ -355,7 +360,9 @@ def test_nonlinear_run_follows_the_loop_matrix():
 
 
 def test_overdamped_link_modes_are_not_followed():
-    structure, case = arrays(link__modes=3, link__damping_ratio=0.9999999999999999)
+    structure, case = arrays(
+        link__modes=3, link__damping_ratio=0.9999999999999999, motion__waypoints=(HOME, HOME)
+    )
     report = loop_report(structure, case, HOME_POSE)
     assert report.damping_ratio.shape == (3, 3)
     assert 0 < report.spectral_radius < 1 and report.gain_margin > 1
@@ -378,19 +385,16 @@ def test_decay_of_the_nonlinear_run_is_the_predicted_damping():
 
 def test_slowest_decay_is_that_of_the_largest_eigenvalue():
     """Stable and unstable, of a loop as it is and of a matrix with a repeated eigenvalue."""
-    study = paper_study().change(link__modes=2, control__modes=2)
-    structure, case = build_structure(study), as_arrays(build_case(study))
-    matrices = jax.jit(closed_loop, static_argnums=0)(
-        structure._replace(n_steps=1), case, np.array(HOME)
-    )
+    structure, case = arrays()
+    matrices = loop_matrices(structure, case, HOME_POSE)
     period = case.electronics.period
     for factor in (0.0, 1.0, 40.0):
         whole = np.asarray(matrices.open + factor * matrices.feedback)
         wanted = -np.log(np.abs(np.linalg.eigvals(whole)).max()) / period
-        assert abs(slowest_decay(whole, period) - wanted) < 1e-3
+        assert abs(slowest(whole, period) - wanted) < 1e-3
     assert wanted < -1  # the last one is unstable
     jordan = np.array([[0.9, 1.0], [0.0, 0.9]])
-    np.testing.assert_allclose(slowest_decay(jordan, 1.0), -np.log(0.9), atol=1e-6)
+    np.testing.assert_allclose(slowest(jordan, 1.0), -np.log(0.9), atol=1e-6)
 
 
 @pytest.mark.parametrize("swing", [0.3, 0.02, 0.0])
@@ -407,16 +411,39 @@ def test_slowest_decay_has_a_gradient(swing):
     y, x = left[:, k].conj(), right[:, k]
     exact = -((y @ change @ x) / (y @ x) / value[k]).real / 0.01
 
-    def decay(e):
-        return slowest_decay(matrix + e * change, 0.01)
+    np.testing.assert_allclose(decay_slope(matrix, change), exact, rtol=1e-4)
+    np.testing.assert_allclose(decay_tangent(matrix, change), exact, rtol=1e-4)
+    up, down = (slowest(matrix + e * change, 0.01) for e in (1e-5, -1e-5))
+    np.testing.assert_allclose((up - down) / 2e-5, exact, rtol=1e-6)
 
-    np.testing.assert_allclose(jax.grad(decay)(0.0), exact, rtol=1e-4)
-    np.testing.assert_allclose(jax.jvp(decay, (0.0,), (1.0,))[1], exact, rtol=1e-4)
-    difference = (decay(1e-5) - decay(-1e-5)) / 2e-5
-    np.testing.assert_allclose(difference, exact, rtol=1e-6)
+
+def decay_along(matrix, change, e):
+    return slowest_decay(matrix + e * change, 0.01)
+
+
+@jax.jit
+def decay_slope(matrix, change):
+    return jax.grad(partial(decay_along, matrix, change))(0.0)
+
+
+@jax.jit
+def decay_tangent(matrix, change):
+    return jax.jvp(partial(decay_along, matrix, change), (0.0,), (1.0,))[1]
 
 
 # --- sums over all that follows -------------------------------------------------------------------
+
+
+@jax.jit
+def sums(matrix, start, factor):
+    """Of a matrix times a factor, and the derivative of their size's logarithm."""
+
+    def found(factor):
+        sums = summed_squares(factor * matrix, start)
+        return sums.log_size, sums
+
+    (_, sums), slope = jax.value_and_grad(found, has_aux=True)(factor)
+    return sums, slope
 
 
 @pytest.mark.parametrize("radius", [0.3, 0.99, 1.01])
@@ -426,16 +453,13 @@ def test_sum_of_squares_solves_its_equation(radius):
     matrix = random.normal(size=(5, 5))
     matrix *= radius / np.abs(np.linalg.eigvals(matrix)).max()
     start = np.diag(random.uniform(size=5))
-    found = summed_squares(matrix, start)
+    found, slope = sums(matrix, start, 1.0)
     if radius < 1:
         whole = found.share * np.exp(found.log_size)
         np.testing.assert_allclose(whole, scipy.linalg.solve_discrete_lyapunov(matrix, start))
 
-    def log_size(factor):
-        return summed_squares(factor * matrix, start).log_size
-
-    slope = jax.grad(log_size)(1.0)
-    difference = (log_size(1 + 1e-6) - log_size(1 - 1e-6)) / 2e-6
+    up, down = (sums(matrix, start, 1 + e)[0].log_size for e in (1e-6, -1e-6))
+    difference = (up - down) / 2e-6
     assert np.isfinite(slope)
     np.testing.assert_allclose(slope, difference, rtol=1e-4)
 
@@ -451,10 +475,11 @@ def test_optimal_damping_of_one_mode_has_a_closed_form():
         found = summed_squares(matrix, np.diag([1.0, 0.0]))
         return found.share[0, 0] * jax.numpy.exp(found.log_size) * period
 
+    found = jax.jit(jax.value_and_grad(energy))
     for zeta in (0.1, 0.5, 0.9):
         wanted = (1 + 4 * zeta**2) / (4 * zeta * omega)
-        np.testing.assert_allclose(energy(zeta), wanted, rtol=0.01)
-    assert abs(jax.grad(energy)(0.5)) < 0.01 * abs(jax.grad(energy)(0.4))
+        np.testing.assert_allclose(found(zeta)[0], wanted, rtol=0.01)
+    assert abs(found(0.5)[1]) < 0.01 * abs(found(0.4)[1])
 
 
 def test_spillover_is_what_damping_of_the_uncontrolled_modes_loses():
@@ -495,30 +520,22 @@ def test_spillover_has_a_gradient():
         return spillover(structure, changed, closed_loop(structure, changed, HOME_POSE))
 
     @jax.jit
-    def pushed(x):
-        return jax.vmap(lambda d: jax.jvp(lengthened, (x,), (d,)))(np.eye(2))
+    def pushed(x, way):
+        return jax.jvp(lengthened, (x,), (way,))
 
     x = np.array([0.7, 1.01])
-    slopes = pushed(x)[1]
-    for slope, way in zip(slopes, 1e-4 * np.eye(2), strict=True):
-        up, down = pushed(x + way)[0][0], pushed(x - way)[0][0]
+    for way in np.eye(2):
+        slope = pushed(x, way)[1]
+        up, down = (pushed(x + e * way, way)[0] for e in (1e-4, -1e-4))
         assert abs(slope) > 1e-4
         np.testing.assert_allclose(slope, (up - down) / 2e-4, rtol=1e-4)
 
 
 def test_linear_residual_agrees_with_the_run():
-    changes = {
-        "run__duration": 0.15,
-        "motion__waypoints": (HOME, (0.0, 0.002, HOME[2])),
-        "motion__move_time": 0.03,
-        "shaper__kind": "none",
-        "metrics__residual_delay": 0.02,
-        "metrics__residual_length": 0.09,
-    }
-    study = STUDY.change(**changes)
+    study = STUDY.change(**LINEAR, motion__waypoints=(HOME, (0.0, 0.002, HOME[2])))
     structure, case = build_structure(study), as_arrays(build_case(study))
     matrices = loop_matrices(arrays()[0], case, HOME_POSE)
     linear = jax.jit(linear_residual, static_argnums=0)(structure, case, matrices)
-    result = run(structure, case, False)
+    result = run(structure, case)
     assert result.status == 0
     np.testing.assert_allclose(linear, result.metrics.residual_rms, rtol=0.1)

@@ -11,7 +11,6 @@ import pytest
 from scipy.io import savemat
 
 from jaxmodel.controller import read_back
-from jaxmodel.prepare import prepare
 from jaxmodel.state_space import (
     IllConditionedError,
     StateSpace,
@@ -20,30 +19,36 @@ from jaxmodel.state_space import (
 )
 from studies.cli import main
 from studies.engine.blocks import responses
-from studies.engine.controller import fixed_controller
+from studies.engine.controller import arrange, fixed_controller
 from studies.engine.executor import Executor
 from studies.engine.margins import judge_loops
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
+from studies.engine.preflight import preflight
 from studies.engine.runs import run_study
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
+from studies.export.c_fixed import fixed_source
+from studies.export.c_floating import floating_source
+from studies.export.document import controller_of as controller_in
+from studies.export.document import document
+from studies.export.fixed import check_error, rail_samples
+from studies.export.fixed_blocks import design_integers
+from studies.export.floating import respond as respond_floating
 from studies.export.in_the_loop import replay
+from studies.export.integers import respond as respond_fixed
+from studies.export.run import DAC_BITS
+from studies.export.verify import DOUBLE, _largest_demand, compare_values, load_code
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table
 from studies.spillover.certificate import certify
 from studies.spillover.plants import ModelMismatch
-from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import load_study, parse_study
 from studies.study.template import study_template
+from tests.canonical import MACHINE as SHORT
+from tests.exports import needs_compiler
+from tests.jaxmodel.kept import arrays, without_run
 
 PERIOD = 1e-4
-SHORT = {
-    "run": {"duration": 0.06},
-    "link": {"modes": 3},
-    "motion": {"waypoints": [[0.0, 0.0, 0.5236], [0.0, 0.01, 0.5236]], "move_time": 0.03},
-    "shaper": {"kind": "none"},
-    "metrics": {"residual_length": 0.02, "residual_delay": 0.002},
-}
 
 
 def random_system(order, ports, seed=0, gain=0.01):
@@ -81,14 +86,32 @@ def stepped(matrices, volts, limit):
     return np.array(rows)
 
 
-def without_run(study):
-    """Structure of one step, so that runs of any length share programs, and case."""
-    return build_structure(study)._replace(n_steps=1), as_arrays(build_case(study))
-
-
 def controller_of(study):
-    prepared = jax.jit(prepare, static_argnums=0)(*without_run(study))
-    return jax.tree.map(np.asarray, prepared.loop.controller)
+    return preflight(*arrays(study)).controller
+
+
+def assert_code_is_the_controller(study):
+    """On random codes, in C to 1e-12, in fixed point bit for bit with its integer model."""
+    exported, compiler = fixed_controller(study), needs_compiler()
+    top, step = int(exported.controller.adc_top), float(exported.controller.adc_step)
+    codes = np.random.default_rng(2).integers(1, top, (300, 3, 3))
+    wanted = np.asarray(replay(exported.controller, codes))
+    assert np.abs(wanted).max() > 1
+    source = floating_source(exported, "own", ["a test"])
+    with load_code(exported, source, "own", compiler, np.float64, np.float64) as code:
+        volts, faults = code.respond(codes * step)
+    largest = _largest_demand(exported, codes)
+    check = compare_values("", volts, wanted, DOUBLE, largest)
+    assert check.is_met and not faults.any(), check
+    signals = respond_floating(exported.channels, exported.controller, codes)
+    fixed, _ = design_integers(exported, signals, DAC_BITS)
+    check_error(exported, fixed.error, fixed.wires.dac_step)
+    model = respond_fixed(fixed, codes, rail_samples(1 / PERIOD))
+    source = fixed_source(exported, fixed, "own", ["a test"], "")
+    with load_code(exported, source, "own", compiler, np.uint16, np.int32) as code:
+        found, faults = code.respond(codes)
+    assert not model.limited.any() and not faults.any()
+    np.testing.assert_array_equal(found, model.codes)
 
 
 @pytest.mark.parametrize("order", [0, 1, 5, 12])
@@ -177,57 +200,87 @@ def test_one_link_s_controller_serves_each_link(tmp_path):
     np.testing.assert_allclose(one, every, atol=1e-11)
 
 
-def test_margins_and_the_sweep(thirty):
-    """Kernel and scan agree to 1e-9; a batch's margins are those of the single run."""
+@pytest.fixture(scope="module")
+def margins(thirty):
+    """Structure, cases and layout of two gains in a sweep, and the run of the latter alone."""
     study = thirty[2]
     data = {k: v for k, v in study.model_dump().items() if v}
-    sweep = {"axes": {"gain": [0.3, 1.0]}}
-    table = build_table(parse_sweep(data | {"sweep": sweep}))
+    table = build_table(parse_sweep(data | {"sweep": {"axes": {"gain": [0.3, 1.0]}}}))
     group = plan_groups(table, np.arange(2), local_layout)[0]
     structure = group.structure._replace(metrics=("residual_rms", "peak_voltage"))
-    cases = chunk_cases(table, group.rows, structure, group.layout.size)
+    return structure, chunk_cases(table, group.rows, structure, group.layout.size), group.layout
+
+
+def test_a_batch_s_margins_are_those_of_single_loops(thirty, margins):
+    study = thirty[2]
+    alone = loop_report(*without_run(study), np.array(study.motion.waypoints[0]))
+    assert alone.is_stable and 1 < alone.gain_margin < 60
+    found = judge_loops(*margins[:2]).gain_margin[:2]
+    np.testing.assert_allclose(found, alone.gain_margin / np.array([0.3, 1.0]), rtol=1e-3)
+
+
+@pytest.mark.long  # in short: all operations of a loop, in test_delay
+def test_kernel_is_scan(thirty, margins):
+    structure, cases, layout = margins
     one, other = (
-        Executor(structure, group.layout, kind=name).start(cases).wait()
-        for name in ("kernel", "scan")
+        Executor(structure, layout, kind=name).start(cases).wait() for name in ("kernel", "scan")
     )
     np.testing.assert_array_equal(one.status, 0)
     for name in structure.metrics:
         np.testing.assert_allclose(other.metrics[name], one.metrics[name], rtol=1e-9)
-    report = loop_report(structure, build_case(study), np.array(study.motion.waypoints[0]))
-    margin = judge_loops(structure, cases).gain_margin[:2]
-    np.testing.assert_allclose(margin, report.gain_margin / np.array([0.3, 1.0]), rtol=1e-3)
+    found = run_study(thirty[2], has_record=False)
+    assert found.loop.is_stable and found.loop.gain_margin > 1
 
 
-@pytest.mark.parametrize("target", ["c", "c-fixed"])
-def test_export_is_verified(thirty, tmp_path, target, capsys):
-    """In C to 1e-12, in fixed point bit for bit with its integer model."""
-    _, _, study = thirty
-    (tmp_path / "study.toml").write_text(study_template(study))
-    main(["export", str(tmp_path / "study.toml"), "--target", target, "--out", str(tmp_path)])
-    assert "comparisons agree" in capsys.readouterr().out
+def test_code_of_a_system(thirty):
+    assert_code_is_the_controller(thirty[2])
 
 
-def test_export_of_some_links_with_feedthrough(tmp_path, capsys):
+def test_code_of_some_links_with_feedthrough(tmp_path):
     a, b, c, d = random_system(4, 3)
     np.savez(tmp_path / "one.npz", a=a, b=b, c=c, d=d, dt=PERIOD)
     control = {"links": [False, True, True], "feedthrough_factor": 0.5}
     study = study_with(tmp_path / "one.npz", control=control)
-    assert list(fixed_controller(study).channels.link) == [1, 2]
-    (tmp_path / "study.toml").write_text(study_template(study))
-    for target in ("json", "c-fixed"):
+    exported = fixed_controller(study)
+    assert list(exported.channels.link) == [1, 2]
+    assert_code_is_the_controller(study)
+    described = document(exported, "")
+    assert np.shape(described.numbers["state_matrix"].value) == (3, 2, 2, 2)
+    codes = np.random.default_rng(2).integers(1, 4095, (300, 3, 3))
+    again, wanted = controller_in(described), np.asarray(replay(exported.controller, codes))
+    found = respond_floating(arrange(again[0], described.law), again[0], codes).command
+    np.testing.assert_allclose(found, wanted, atol=DOUBLE * np.abs(wanted).max())
+
+
+@pytest.mark.long  # in short: the code of each kind of system on random codes
+@pytest.mark.parametrize("kind", ["links", "limits", "static"])
+def test_export_is_verified(tmp_path, capsys, kind):
+    fields = dict(zip("ABCD", random_system(4, 3), strict=True))
+    changes = {"control": {"links": [False, True, True], "feedthrough_factor": 0.5}}
+    if kind == "limits":
+        fields, changes = told_of_limits(), {"electronics": {"voltage_limit": 2.0}}
+    elif kind == "static":
+        fields, changes = {"D": 5 * fields["D"]}, {}
+    np.savez(tmp_path / "x.npz", **fields, dt=PERIOD)
+    (tmp_path / "study.toml").write_text(study_template(study_with(tmp_path / "x.npz", **changes)))
+    for target in ("json", "c", "c-fixed"):
         main(["export", str(tmp_path / "study.toml"), "--target", target, "--out", str(tmp_path)])
         assert "comparisons agree" in capsys.readouterr().out
-    document = json.loads((tmp_path / "flexlink.json").read_text())
-    assert np.shape(document["numbers"]["state_matrix"]["value"]) == (3, 2, 2, 2)
 
 
-@pytest.mark.parametrize("end", [".npz", ".json"])
-def test_limits_are_told_where_the_file_says_how(tmp_path, capsys, end):
-    """x_(k+1) = A x + B y + E (v - u), in the loop and in exported code."""
+def told_of_limits():
+    """Matrices of a controller that is told of limits."""
     a, b, c, d = random_system(4, 9, gain=0.3)
     tell = 0.05 * np.random.default_rng(5).normal(size=(4, 9))
     assert np.abs(np.linalg.eigvals(a - tell @ c)).max() < 1
-    matrices = {"A": a, "B": b, "C": c, "D": d, "anti_windup": tell}
+    return {"A": a, "B": b, "C": c, "D": d, "anti_windup": tell}
+
+
+@pytest.mark.parametrize("end", [".npz", ".json"])
+def test_limits_are_told_where_the_file_says_how(tmp_path, end):
+    """x_(k+1) = A x + B y + E (v - u), in the loop and in exported code."""
+    matrices = told_of_limits()
+    a, b, c, d, tell = matrices.values()
     path = tmp_path / f"one{end}"
     if end == ".npz":
         np.savez(path, **matrices, dt=PERIOD)
@@ -250,11 +303,7 @@ def test_limits_are_told_where_the_file_says_how(tmp_path, capsys, end):
     assert most > 4
     np.testing.assert_allclose(replay(controller, codes), wanted, atol=1e-10)
     if end == ".json":
-        (tmp_path / "study.toml").write_text(study_template(study))
-        for target in ("c", "c-fixed"):
-            options = ["--target", target, "--out", str(tmp_path)]
-            main(["export", str(tmp_path / "study.toml"), *options])
-            assert "comparisons agree" in capsys.readouterr().out
+        assert_code_is_the_controller(study)
 
 
 def test_formats_and_names(tmp_path):
@@ -269,18 +318,12 @@ def test_formats_and_names(tmp_path):
     found = [study_with(tmp_path / f"x.{end}").state_space for end in ("json", "npz", "mat")]
     assert found[0].a == found[1].a == found[2].a
     assert found[0].inputs == found[1].inputs == found[2].inputs == tuple(ports["inputs"])
-    controller = controller_of(study_with(tmp_path / "x.mat"))
-    assert np.abs(dense(controller.feedback)[3][7, 3]) == pytest.approx(abs(d[0, 0]))
+    system = jax.tree.map(np.asarray, arrays(study_with(tmp_path / "x.mat"))[1].control.system)
+    assert np.abs(dense(system)[3][7, 3]) == pytest.approx(abs(d[0, 0]))
     text = study_template(study_with(tmp_path / "x.npz"))
     (tmp_path / "x.npz").unlink()
     (tmp_path / "study.toml").write_text(text)
     assert load_study(tmp_path / "study.toml").state_space.a == found[0].a
-
-
-def test_a_single_run_says_its_margin(thirty):
-    study = thirty[2]
-    found = run_study(study, has_record=False)
-    assert found.loop.is_stable and found.loop.gain_margin > 1
 
 
 REFUSED = {
@@ -404,7 +447,7 @@ def test_a_static_gain_is_a_controller(tmp_path):
     np.testing.assert_allclose(replay(controller, codes), volts @ d.T, atol=1e-12)
 
 
-def test_a_static_gain_has_a_margin_and_an_export(tmp_path, capsys):
+def test_a_static_gain_has_a_margin_and_code(tmp_path):
     d = 0.05 * np.random.default_rng(0).normal(size=(3, 3))
     (tmp_path / "d.json").write_text(json.dumps({"D": d.tolist(), "dt": PERIOD}))
     study = study_with(tmp_path / "d.json")
@@ -414,9 +457,7 @@ def test_a_static_gain_has_a_margin_and_an_export(tmp_path, capsys):
         for f in (1.0, 2.0)
     )
     assert twice.gain_margin == pytest.approx(margin.gain_margin / 2, rel=1e-3)
-    (tmp_path / "study.toml").write_text(study_template(study))
-    main(["export", str(tmp_path / "study.toml"), "--target", "c", "--out", str(tmp_path)])
-    assert "comparisons agree" in capsys.readouterr().out
+    assert_code_is_the_controller(study_with(tmp_path / "d.json", control={"gain_factor": 20.0}))
 
 
 def test_ideal_feedback_has_no_controller_of_this_kind(thirty):
@@ -424,11 +465,17 @@ def test_ideal_feedback_has_no_controller_of_this_kind(thirty):
         study_with(thirty[1], control={"feedback": "ideal"})
 
 
-def test_it_is_certified(tmp_path, capsys):
+def test_it_is_certified_with_its_delay(tmp_path):
     """On plants that differ from the study's; beside all laws."""
-    a, b, c, d = random_system(2, 3, gain=1e-3)
+    a, b, c, d = random_system(2, 3, gain=0.05)
     np.savez(tmp_path / "one.npz", a=a, b=b, c=c, d=d, dt=PERIOD)
-    study = study_with(tmp_path / "one.npz")
-    found = certify(study, bases=("pinned_pinned",), sizes=(3, 6), mismatches=(ModelMismatch(),))
-    report = loop_report(*without_run(study), np.array(study.motion.waypoints[0]), n_modes=6)
-    assert found.margin[0, 0, 1] == pytest.approx(report.gain_margin, rel=1e-3)
+    study = study_with(tmp_path / "one.npz", electronics={"delay": 1.5})
+    found = certify(study, bases=("pinned_pinned",), sizes=(6,), mismatches=(ModelMismatch(),))
+    report, other = (
+        loop_report(*without_run(x), np.array(study.motion.waypoints[0]), n_modes=6)
+        for x in (study, study.change(electronics__delay=1.25))
+    )
+    assert report.gain_margin < 60
+    np.testing.assert_allclose(found.margin[0, 0, 0], report.gain_margin, rtol=2e-4)
+    np.testing.assert_allclose(found.radius[0, 0, 0], report.spectral_radius, rtol=1e-9)
+    assert abs(other.gain_margin / report.gain_margin - 1) > 0.02

@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,10 @@ import typer
 
 from studies.cli import app
 from studies.show.document import documented
+from studies.space.spec import parse_sweep
+from studies.study.template import toml_text
 from tests import TOP
+from tests.canonical import MACHINE
 from tests.studies.test_cli import run
 
 PAGE = (TOP / "docs" / "how-to" / "automation.md").read_text(encoding="utf-8")
@@ -24,41 +28,52 @@ def block(language):
     return text
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("automation")
+SWEEP = tomllib.loads(block("toml"))
 
 
-def test_the_example_runs_as_written(capsys, folder, monkeypatch):
-    monkeypatch.chdir(folder)
-    Path("small.toml").write_text(block("toml"))
+@pytest.mark.parametrize(
+    "study", [MACHINE | {"sweep": SWEEP["sweep"]}, pytest.param(SWEEP, marks=pytest.mark.long)]
+)
+def test_the_example_runs(capsys, tmp_path, monkeypatch, study):
+    """In short with a smaller study."""
+    monkeypatch.chdir(tmp_path)
+    parse_sweep(SWEEP)
+    Path("small.toml").write_text(toml_text(study))
     for line in block("sh").splitlines():
         call, target = re.fullmatch(r"(?:timeout \d+ )?(.*?)(?: > (\S+\.json))?", line).groups()
         name, *arguments = shlex.split(call)
         code, out, err = run(capsys, *arguments)
         assert (name, code, err) == ("studies", 0, ""), line
+        assert out or "--quiet" in arguments
+        assert not out or "--quiet" not in arguments
         if target:
             Path(target).write_text(out)
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
         exec(block("python"), {})
     assert "gain factor" in printed.getvalue() and "warnings []" in printed.getvalue()
-    reading_needs_no_jax(folder)
+    quick_commands_need_no_jax(tmp_path / "small")
 
 
-def reading_needs_no_jax(folder):
-    """Nor SciPy, unless failures are looked into."""
+def quick_commands_need_no_jax(folder):
+    """Nor drawing, nor SciPy, unless failures are looked into: they would wait seconds for it."""
     code = (
         "import sys\n"
         "from studies.cli import main\n"
-        "for command in (['show'], ['best', '--by', 'residual_rms']):\n"
-        "    for more in ([], ['--json']):\n"
-        f"        main([*command, {str(folder / 'small')!r}, *more])\n"
+        f"sweep = {str(folder)!r}\n"
+        "for command in (['--help'], ['init'], ['show', sweep], ['show', sweep, '--json'],\n"
+        "    ['best', '--by', 'residual_rms', sweep],\n"
+        "    ['best', '--by', 'residual_rms', sweep, '--json']):\n"
+        "    try:\n"
+        "        main(command)\n"
+        "    except SystemExit as end:\n"
+        "        assert not end.code\n"
         "slow = {'jax', 'llvmlite', 'matplotlib', 'pandas', 'scipy', 'xarray'}\n"
         "print(sorted(slow & set(sys.modules)), file=sys.stderr)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stderr.strip()) == (0, "[]")
+    assert "velocity_gain" in done.stdout
 
 
 def test_calls_and_their_options_exist():

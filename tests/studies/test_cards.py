@@ -1,44 +1,46 @@
 """Results as notebooks show them, and the progress of long commands there."""
 
 import io
+from pathlib import Path
+from types import SimpleNamespace
 
 import IPython.display
+import numpy as np
 import pytest
 from rich.console import Console
 
-import studies
 from studies.cards import CARDS
+from studies.engine.modes import NamedModes
 from studies.engine.progress import Phases
 from studies.engine.runs import run_study
-from studies.spillover import ModelMismatch, certify
+from studies.export.run import Exported
+from studies.export.verify import Check, Verification
+from tests.canonical import MACHINE, study_of
+from tests.studies.show.test_findings import certificate
 
-HOME = (0.0, 0.0, 0.5236)
-
-
-def small_study(**fields):
-    return studies.Study(
-        title="<script>x</script> & y",
-        run={"duration": 0.1},
-        link={"modes": 3},
-        motion={"waypoints": (HOME, (0.0, 0.01, 0.5236)), "move_time": 0.03},
-        metrics={"residual_length": 0.03},
-        **fields,
-    )
+TITLE = "<script>x</script> & y"
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory):
-    """One of each kind that is quick to make."""
-    folder, quiet = tmp_path_factory.mktemp("cards"), Console(file=io.StringIO())
-    study = small_study()
-    studies.write_study(folder / "study.toml", study)
-    design = studies.load_design(folder / "study.toml")
-    few = {"bases": ("pinned_pinned",), "sizes": (3, 4), "mismatches": (ModelMismatch(),)}
+def results():
+    """One of each kind, the run a true one."""
+    study = study_of(MACHINE, title=TITLE)
+    check = Check("voltages", "1e-16 V", "1e-12 V", True)
+    verified = Verification([check], [], {}, {}, {})
+    shares = np.zeros((2, 3, 3))
+    shares[1, 0, 0] = 0.9
     return {
         "Run": run_study(study),
-        "NamedModes": studies.machine_modes(study),
-        "Certificate": certify(study, **few),
-        "Exported": studies.export_design(design, "json", folder / "out", console=quiet),
+        "NamedModes": NamedModes(
+            frequency=np.array([60.0, 114.0]),
+            damping_ratio=np.full(2, 0.01),
+            shape=np.zeros((12, 2)),
+            link_share=shares,
+            drive_share=np.array([1.0, 0.1]),
+            turn_share=np.zeros(2),
+        ),
+        "Certificate": certificate(study=study),
+        "Exported": Exported(SimpleNamespace(study=study), "json", (Path("x.json"),), verified),
     }
 
 
@@ -52,8 +54,9 @@ def test_a_result_shows_itself(results, name):
     assert len(html) < 1e5
 
 
-def test_a_run_without_trajectories_shows_its_numbers():
-    html = run_study(small_study(), has_record=False, has_loop=False)._repr_html_()
+def test_a_run_without_trajectories_shows_its_numbers(results):
+    run = results["Run"]
+    html = run._replace(result=run.result._replace(record=None), loop=None)._repr_html_()
     assert "residual rms [µm]" in html and "<img" not in html and "peak of the run" not in html
 
 

@@ -1,6 +1,6 @@
 """The command line: what it writes, and that bad input ends in one message and exit code 2.
 
-All short runs share one machine of two modes, so that it is compiled once.
+All short runs are of one small study.
 """
 
 import ast
@@ -15,6 +15,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,32 +24,19 @@ import xarray
 from rich.table import Table
 
 import studies
-from studies import cli
+from studies import cli, sources
 from studies.cli import app, console, main
 from studies.engine.modes import machine_modes
 from studies.study.files import READY
 from studies.study.margin import margin_in_db
 from studies.study.spec import load_study, parse_study
+from tests import canonical
+from tests.canonical import HOME, MACHINE
 from tests.documents import page
 from tests.pages import TITLE, parsed, rendered, text_of
 
-HOME_PHI = math.pi / 6
-SHORT = f"""
-[run]
-duration = 0.05
-[link]
-modes = 2
-[control]
-modes = 2
-[motion]
-waypoints = [[0, 0, {HOME_PHI}], [0, 0.002, {HOME_PHI}]]
-move_time = 0.02
-[shaper]
-kind = "ei"
-[metrics]
-residual_delay = 0.0
-residual_length = 0.02
-"""
+HOME_PHI = HOME[2]
+SHORT = canonical.text_of(MACHINE)
 
 
 def run(capsys, *arguments):
@@ -78,7 +66,7 @@ def test_names_that_are_no_utf_8_are_refused(capsys, tmp_path):
     name = os.fsdecode(os.fsencode(tmp_path) + b"/\xff.toml")
     Path(name).write_text(SHORT)
     assert "not UTF-8 text; rename" in refused(capsys, "simulate", name, "--out", tmp_path / "x.h5")
-    assert load_study(name).link.modes == 2
+    assert load_study(name).link.modes == 3
 
 
 def refused(capsys, *arguments):
@@ -142,7 +130,7 @@ def test_simulate_writes_labelled_trajectories(short_run, name):
 
 
 def test_simulate_writes_a_consistent_run(short_run):
-    axes = {"time": 500, "link": 3, "station": 3, "mode": 2, "patch": 3, "pose_axis": 3}
+    axes = {"time": 500, "link": 3, "station": 3, "mode": 3, "patch": 3, "pose_axis": 3}
     assert {name: short_run.sizes[name] for name in axes} == axes
     np.testing.assert_allclose(short_run.time, np.arange(500) * 1e-4, rtol=0, atol=1e-15)
     np.testing.assert_allclose(short_run.station, [0.25, 0.5, 0.75])
@@ -152,8 +140,8 @@ def test_simulate_writes_a_consistent_run(short_run):
     np.testing.assert_allclose(ratio, np.broadcast_to(short_run.spectrum_point, ratio.shape))
     assert int(short_run.status) == 0 and float(short_run.gain_margin) > 1
     assert json.loads(short_run.attrs["study"])["title"] == TITLE
-    # the platform arrives (2 mm within 50 um), and middle and mid-span station are one place
-    np.testing.assert_allclose(short_run.pose[-1], [0, 0.002, HOME_PHI], rtol=0, atol=5e-5)
+    # the platform arrives, and middle and mid-span station are one place
+    assert np.all(abs(short_run.pose[-1] - [0, 0.01, HOME_PHI]) < [5e-5, 5e-5, 1e-4])
     middle = short_run.chord_deflection_stations.sel(station=0.5)
     np.testing.assert_allclose(short_run.chord_deflection, middle, rtol=1e-12, atol=1e-18)
     assert float(abs(short_run.actuator_voltage).max()) > 0.1
@@ -170,7 +158,7 @@ def test_simulate_prints_its_answer_without_a_file(short_folder, short_run, caps
 
 def test_the_metrics_agree_with_the_trajectories(short_run):
     after = short_run.time > float(short_run.command_end) - 0.5e-4
-    within = short_run.time < float(short_run.command_end) + 0.02 - 0.5e-4
+    within = short_run.time < float(short_run.command_end) + 0.015 - 0.5e-4
     window = short_run.chord_deflection_stations[(after & within).values]
     rms = np.sqrt((window**2).mean("time"))
     np.testing.assert_allclose(short_run.residual_rms, rms, rtol=1e-9)
@@ -184,8 +172,8 @@ def test_the_report_of_a_run_is_whole(short_folder, short_run):
     assert {path.name for path in short_folder.iterdir()} == names | figures | {"short.toml"}
     found = parsed((short_folder / "my run.html").read_text(encoding="utf-8"))
     assert found.title == f"{TITLE}: one run" and TITLE in found.text
-    # links, platform, two tracked modes, versions
-    assert len(found.images) == 4 and found.rows == [[8] * 4, [4] * 4, [3] * 3, [2] * 9]
+    # links, platform, three tracked modes, versions
+    assert len(found.images) == 4 and found.rows == [[8] * 4, [4] * 4, [3] * 4, [2] * 9]
     rms = f"{1e6 * float(short_run.residual_rms[1].max()):.4g}"
     margin = f"gain margin {margin_in_db(float(short_run.gain_margin))}, the factor"
     watched = f"The run ends {50 - 1e3 * float(short_run.command_end):.4g} ms after"
@@ -197,7 +185,7 @@ def test_the_report_of_a_run_is_whole(short_folder, short_run):
         "settling time [ms]",
         "φ [µrad]",
         "flexlink-studies",
-        "residual_length = 0.02",
+        "residual_length = 0.015",
     ):
         assert part in " ".join(found.text.split())
     assert "/" not in found.text.partition("Versions")[2].partition("Study file")[0]  # no path
@@ -296,6 +284,7 @@ def test_shares_of_modes_are_what_their_frequencies_gain_from_stiffness(thicknes
         np.testing.assert_allclose(np.sum(of_drive[kind]), found.drive_share[kind].sum(), atol=2e-6)
 
 
+@pytest.mark.long  # in short: two poses of a five-bar, and a pose of a loaded machine
 def test_modes_at_another_pose_differ(capsys):
     moved = run(capsys, "modes", "--modes", 2, "--pose", "0.01,0.005,0.6", "--json")
     home = run(capsys, "modes", "--modes", 2, "--json")
@@ -344,52 +333,50 @@ def test_modes_refuses(capsys, arguments, words):
     assert words in refused(capsys, "modes", *arguments)
 
 
-def change(old, new):
-    assert old in SHORT
-    return SHORT.replace(old, new)
-
-
-WAYPOINTS = f"[[0, 0, {HOME_PHI}], [0, 0.002, {HOME_PHI}]]"
-IDEAL = '[control]\nfeedback = "ideal"\nvelocity_gain = '
+changed = partial(canonical.text_of, MACHINE)
 # 110 mm against the normal of guide 1 every link stands well at phi = 0 and at -120 deg; turning
 # from one to the other takes h of link 1 from 29 mm through 0 (parallel to the guide) to -6 mm.
 X, Y = 0.0952627944, 0.055
-TURN = f"[[{X}, {Y}, 0], [{X}, {Y}, {-2 * math.pi / 3}]]"
+TURN = [[X, Y, 0.0], [X, Y, -2 * math.pi / 3]]
+
+
+def ideal(gain):
+    return {"feedback": "ideal", "velocity_gain": [gain, 1.0, 1.0]}
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         (
-            change(WAYPOINTS, f"[[0, 0, {HOME_PHI}], [0.3, 0, {HOME_PHI}]]"),
+            changed(motion={"waypoints": [HOME, [0.3, 0.0, HOME_PHI]]}),
             "motion.waypoints.1 = [0.3, 0.0, 0.523598775598",
         ),
-        (change(WAYPOINTS, TURN), "(here: singular pose: a link along or across the path of its"),
         (
-            change("duration = 0.05", "duration = 0.025"),
-            "run.duration = 0.025; allowed: at least 0.0288, the end of the motion with its shaper",
+            changed(motion={"waypoints": TURN}),
+            "(here: singular pose: a link along or across the path of its",
         ),
         (
-            change("residual_length = 0.02", "residual_length = 0.04"),
-            "metrics.residual_length = 0.04; allowed: 0.0001 to 0.0212, from one sample to what "
+            changed(run={"duration": 0.035}, shaper={"kind": "ei"}),
+            "run.duration = 0.035; allowed: at least 0.0388, the end of the motion with its shaper",
+        ),
+        (
+            changed(metrics={"residual_length": 0.04}),
+            "metrics.residual_length = 0.04; allowed: 0.0001 to 0.02, from one sample to what "
             "run.duration = 0.05 leaves",
         ),
         (
-            change("[control]", IDEAL + "[1e6, 1, 1]"),
+            changed(control=ideal(1e6)),
             "control.gain_factor = 1.0; allowed: gains low enough for 200 plant steps per sample",
         ),
+        (changed(control=ideal(1e3), run={"substeps": 1}), "run.substeps = 1; allowed: "),
         (
-            change("[control]", IDEAL + "[1e3, 1, 1]").replace("[run]", "[run]\nsubsteps = 1"),
-            "run.substeps = 1; allowed: ",
-        ),
-        (
-            SHORT + "[electronics]\nlowpass_ratio = [3.0, 11.0]",
+            changed(control={"modes": 2}, electronics={"lowpass_ratio": [3.0, 11.0]}),
             "low-pass corners below half the sample rate, 5000 Hz; the highest of the 2 is at 5033",
         ),
-        (change("[link]", "[link]\nlength = 0.01"), "patches.actuator_length = 0.03; allowed: at"),
+        (changed(link={"length": 0.01}), "patches.actuator_length = 0.03; allowed: at"),
         (
-            change("[link]", "[link]\nthickness = 0.1\nyoungs_modulus = 2e12\ndensity = 1"),
-            "link.modes = 2; allowed: modes up to 1.592e+05 Hz at electronics.sample_rate_hz",
+            changed(link={"thickness": 0.1, "youngs_modulus": 2e12, "density": 1.0}),
+            "link.modes = 3; allowed: modes up to 1.592e+05 Hz at electronics.sample_rate_hz",
         ),
         ("[patches]\ncenters = [0.05, 0.06, 0.15]", "so that no patches overlap [m]"),
         ("[control]\nmodes = 4", "control.modes = 4; allowed: 1 to 3, the number of patch pairs"),
@@ -459,16 +446,14 @@ def test_info_names_versions_devices_and_precision(capsys):
 
 
 def test_an_unstable_loop_is_said_loudly_and_beside_no_control(capsys, tmp_path):
-    loud = SHORT.replace("modes = 2\n[motion]", "modes = 2\ngain_factor = 20.0\n[motion]")
-    (tmp_path / "loud.toml").write_text(loud)
+    (tmp_path / "loud.toml").write_text(changed(control={"gain_factor": 20.0}))
     out = tmp_path / "run.h5"
     code, text, _ = run(capsys, "simulate", tmp_path / "loud.toml", "--out", out, "--report")
     assert code == 0 and "UNSTABLE LOOP" in text
     report = text_of((tmp_path / "run.html").read_text())
     assert "**UNSTABLE LOOP" in report
     # the column beside is what the same study leaves without control
-    open_study = loud.replace("gain_factor = 20.0", "links = [false, false, false]")
-    (tmp_path / "open.toml").write_text(open_study)
+    (tmp_path / "open.toml").write_text(changed(control={"links": [False] * 3}))
     alone = tmp_path / "open.h5"
     run(capsys, "simulate", tmp_path / "open.toml", "--out", alone)
     with xarray.open_dataset(alone) as data:
@@ -477,27 +462,6 @@ def test_an_unstable_loop_is_said_loudly_and_beside_no_control(capsys, tmp_path)
     column = [cell.strip() for cell in table[0]].index("residual rms without control [µm]")
     found = [float(row[column]) for row in table[1:4]]
     np.testing.assert_allclose(found, wanted, rtol=1e-3)
-
-
-def test_commands_that_run_nothing_need_no_jax(capsys):
-    """Nor drawing: they would wait seconds for both."""
-    code = (
-        "import sys\n"
-        "from studies.cli import main\n"
-        "import studies.sweeps.show\n"
-        "for arguments in (['--help'], ['init']):\n"
-        "    try:\n"
-        "        main(arguments)\n"
-        "    except SystemExit:\n"
-        "        pass\n"
-        "slow = {'jax', 'matplotlib', 'pandas', 'scipy', 'xarray'}\n"
-        "print(sorted(slow & set(sys.modules)), file=sys.stderr)\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120
-    )
-    assert "velocity_gain" in done.stdout
-    assert done.stderr.strip() == "[]"
 
 
 def test_every_command_has_a_call_in_python():
@@ -518,11 +482,46 @@ def test_the_version_is_that_of_the_package(capsys):
     assert run(capsys, "--version") == (0, f"flexlink-studies {studies.__version__}\n", "")
 
 
-def test_only_what_runs_on_a_cluster_needs_its_package():
+#: Modules that need an optional package.
+CLUSTER = [
+    "studies.cluster.runner",
+    "studies.cluster.worker",
+    "studies.screen.workers",
+    "studies.tuning.workers",
+]
+OPTIONAL = ("distributed", "dask", "diffrax", "pyuff", "blackjax", "control")
+
+
+def imported(path):
+    """What a file imports when it is imported: not in functions, nor for type checkers."""
+    waiting, names = list(ast.parse(path.read_bytes()).body), set()
+    for node in waiting:
+        if isinstance(node, ast.Import):
+            names |= {part.name for part in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names |= {node.module, *(f"{node.module}.{part.name}" for part in node.names)}
+        elif not isinstance(node, ast.FunctionDef) and "TYPE_CHECK" not in ast.unparse(node)[:20]:
+            waiting += [x for x in ast.iter_child_nodes(node) if isinstance(x, ast.stmt)]
+    return names | {name.partition(".")[0] for name in names}
+
+
+def test_only_what_runs_on_a_cluster_imports_its_package():
     """`tune` and the rest work after an install without extras."""
-    text = """
+    files = (sources.TOP / "studies").rglob("*.py")
+    modules = {".".join(x.relative_to(sources.TOP).with_suffix("").parts): x for x in files}
+    imports = {module: imported(path) for module, path in modules.items()}
+    lacking, found = None, set()
+    while found != lacking:  # also what imports these
+        lacking = found
+        found = {module for module, names in imports.items() if names & {*OPTIONAL, *lacking}}
+    assert sorted(lacking) == CLUSTER
+
+
+@pytest.mark.long  # in short: as the files say
+def test_only_what_runs_on_a_cluster_needs_its_package():
+    text = f"""
 import importlib, pkgutil, sys
-for name in ("distributed", "dask", "diffrax", "pyuff", "blackjax", "control"):
+for name in {OPTIONAL}:
     sys.modules[name] = None
 import studies
 lacking = []
@@ -534,12 +533,7 @@ for module in pkgutil.walk_packages(studies.__path__, "studies."):
 print(*sorted(lacking))
 """
     run = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=120)
-    assert run.stdout.split() == [
-        "studies.cluster.runner",
-        "studies.cluster.worker",
-        "studies.screen.workers",
-        "studies.tuning.workers",
-    ], run.stderr
+    assert run.stdout.split() == CLUSTER, run.stderr
 
 
 def test_workers_are_named_again_as_they_were():

@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import tomllib
+from functools import partial
 
 import jax
 import numpy as np
@@ -38,28 +39,18 @@ from studies.space.table import build_table
 from studies.store import read_store
 from studies.study.cases import build_case, build_structure
 from studies.study.labels import RESERVED
-from studies.study.spec import paper_study, parse_study
+from studies.study.spec import parse_study
 from studies.study.template import study_template
+from studies.tuning.spec import parse_tuning
 from tests import TOP
+from tests.canonical import MACHINE, study_of, text_of
 
 DOCS = TOP / "docs" / "how-to" / "own-parts.md"
-#: One fast move of a small model.
-SMALL = """
-[run]
-duration = 0.06
-[link]
-modes = 3
-[motion]
-waypoints = [[0, 0, 0.5236], [0, 0.01, 0.5236]]
-move_time = 0.03
-[shaper]
-kind = "none"
-[metrics]
-residual_delay = 0.0
-residual_length = 0.02
-"""
+SMALL = text_of(MACHINE)
+small = partial(study_of, MACHINE, control__modes=2)
 OWN = SMALL + (
     '[control]\nlaw = "even_damping"\nmodes = 2\ngain_factor = 0.5\nlinks = [true, false, false]\n'
+    '[drive]\nkind = "stiffening"\n'
 )
 SWEEP = (
     OWN
@@ -122,29 +113,36 @@ def run(capsys, own, *arguments):
 GAINS = {"srf": {"velocity_gain": (2e-4,) * 3}, "ppf": {"gain_factor": 0.2}}
 
 
-#: The others are run, judged and exported by the tests of exports.
-SHORT = ("modified_imsc",)
-
-
 #: That need no file; for the other see test_state_space.py.
 ALONE = [name for name in LAWS if name != "state_space"]
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=[] if x in SHORT else pytest.mark.long) for x in ALONE]
-)
-def test_every_law_runs_and_is_judged_and_exported(name, tmp_path, capsys):
-    """By name alone: single run, judgement of batches, code in fixed point, proved bit by bit."""
-    study = parse_study(tomllib.loads(SMALL)).change(control__law=name, control__modes=2)
-    study = study.change(**{f"control__{key}": value for key, value in GAINS.get(name, {}).items()})
+def settled(name):
+    return small(
+        control__law=name, **{f"control__{key}": x for key, x in GAINS.get(name, {}).items()}
+    )
+
+
+@pytest.mark.long  # in short: the laws in tests/jaxmodel, and a user's own below
+@pytest.mark.parametrize("name", ALONE)
+def test_every_law_runs_and_is_judged(name):
+    """By name alone: single run, judgement of batches."""
+    study = settled(name)
     found = run_study(study, has_record=False)
     assert found.loop.is_stable
     assert found.loop.damping_ratio[0].max() > 1.2 * study.link.first_damping
     cases = jax.tree.map(lambda x: np.asarray(x)[None], build_case(study))
     batch = judge_loops(build_structure(study), cases)
     np.testing.assert_allclose(batch.gain_margin[0], found.loop.gain_margin, rtol=0.02)
+
+
+@pytest.mark.parametrize(  # of the others, the tests of exports have some
+    "name", [x if x == "modified_imsc" else pytest.param(x, marks=pytest.mark.long) for x in ALONE]
+)
+def test_every_law_is_exported(name, tmp_path, capsys):
+    """Code in fixed point, proved bit by bit."""
     target = "c-fixed" if shutil.which("cc") else "json"
-    path = written(tmp_path, study_template(study))
+    path = written(tmp_path, study_template(settled(name)))
     main(["export", path, "--target", target, "--out", str(tmp_path / "out")])
     assert "verified: " in capsys.readouterr().out
 
@@ -161,31 +159,24 @@ def test_laws_are_a_choice_like_any_other(tmp_path):
     assert len({round(float(x), 3) for x in margin.values()}) == len(ALONE) - 1
 
 
-def test_own_law_and_metric_in_a_single_run(own):
+def test_own_law_drive_and_metric_in_single_runs(own):
+    """The drive is stiffer than PD where its errors are large, 0.1 mm."""
     study = parse_study(tomllib.loads(OWN))
-    weak = run_study(study, has_record=False)
-    strong = run_study(
-        study.change(control__laws={"even_damping": {"constant": (3.0, 3.0, 3.0)}}),
-        has_record=False,
-    )
-    assert weak.loop.damping_ratio[0].max() < strong.loop.damping_ratio[0].max()
-    assert 0 < float(weak.result.metrics.turning) != float(strong.result.metrics.turning)
 
+    def found(**changes):
+        one = study.change(**changes)
+        return run_study(one, has_record=False, has_loop=False).result.metrics
 
-def test_own_drive_in_a_single_run(own):
-    """Stiffer than PD where its errors are large, 0.1 mm."""
-    study = parse_study(tomllib.loads(OWN))
-    peak = [
-        run_study(
-            study.change(drive__kind=kind), has_record=False, has_loop=False
-        ).result.metrics.pose_error_peak[1]
-        for kind in ("pd", "stiffening")
-    ]
-    assert peak[1] < 0.99 * peak[0]
+    weak = found()
+    strong = found(control__laws={"even_damping": {"constant": (3.0, 3.0, 3.0)}})
+    linear = found(drive__kinds={"stiffening": {"cubic": 0.0}})
+    assert 0 < float(weak.turning) != float(strong.turning)
+    assert weak.pose_error_peak[1] < 0.99 * linear.pose_error_peak[1]
 
 
 def test_own_parts_in_a_sweep(own, tmp_path, capsys):
-    run(capsys, own, "sweep", written(tmp_path, SWEEP), "--out", tmp_path / "sweep", "--quiet")
+    said = run(capsys, own, "sweep", written(tmp_path, SWEEP), "--out", tmp_path / "sweep")
+    assert "traced kernel" in said
     data = read_sweep(tmp_path / "sweep")
     constant = data["control.laws.even_damping.constant"]
     share = (np.arange(6) + 0.5) / 6
@@ -193,27 +184,24 @@ def test_own_parts_in_a_sweep(own, tmp_path, capsys):
     np.testing.assert_allclose(data["motion.move_time"], 0.025 + 0.005 * share)
     assert np.all(data["turning"] > 0) and data.variables["turning"].units == "rad s"
     assert np.all(np.diff(data["damping_ratio"][:, 0]) > 0)
+    check_scan(data)
     assert "even_damping" in run(capsys, own, "show", tmp_path / "sweep")
     text = run(capsys, own, "best", tmp_path / "sweep", "--by", "turning")
     assert "turning [rad s]" in text
 
 
-def test_own_parts_on_kernel_and_scan(own):
-    """Equal within 1e-9."""
+def check_scan(data):
+    """XLA's scan equals the kernel of the sweep within 1e-9."""
     table = build_table(parse_sweep(tomllib.loads(SWEEP)))
     group = plan_groups(table, np.arange(len(table)), local_layout)[0]
     structure = group.structure._replace(metrics=("turning", "residual_rms"))
     cases = chunk_cases(table, group.rows, structure, group.layout.size)
-    found = {
-        kind: Executor(structure, group.layout, kind=kind).start(cases).wait().metrics
-        for kind in ("kernel", "scan")
-    }
-    one, *others = found.values()
-    for other in others:
-        for name in ("turning", "residual_rms"):
-            np.testing.assert_allclose(other[name], one[name], rtol=1e-9)
+    found = Executor(structure, group.layout, kind="scan").start(cases).wait().metrics
+    for name in ("turning", "residual_rms"):
+        np.testing.assert_allclose(found[name][:6], data[name], rtol=1e-9)
 
 
+@pytest.mark.long  # in short: its parameter varies in a sweep, traced as in a tuning
 def test_own_law_is_tuned_by_gradient(own, tmp_path, capsys):
     run(capsys, own, "tune", written(tmp_path, TUNE), "--out", tmp_path / "tuned", "--quiet")
     arrays, _ = read_store(tmp_path / "tuned" / "tune.h5")
@@ -221,6 +209,11 @@ def test_own_law_is_tuned_by_gradient(own, tmp_path, capsys):
     assert np.all(np.isfinite(objective))
     study = tomllib.loads((tmp_path / "tuned" / "tuned.toml").read_text())
     assert study["control"]["laws"]["even_damping"]["constant"] != 1.0
+
+
+def test_own_parameters_can_be_tuned(own):
+    (free,) = parse_tuning(tomllib.loads(TUNE)).free.names
+    assert free == "control.laws.even_damping.constant"
 
 
 def test_own_target_is_written(own, tmp_path, capsys):
@@ -272,7 +265,7 @@ def stiff(structure, case, nominal):
 @pytest.mark.long  # in short: margins of position feedback, in test_margins
 def test_position_gains_of_an_own_law_are_fed_back(monkeypatch):
     monkeypatch.setitem(LAWS._entries, "stiff", Law("stiff", "stiff", "mode", stiff))
-    study = parse_study(tomllib.loads(SMALL)).change(control__modes=2, control__law="stiff")
+    study = small(control__law="stiff")
     found = run_study(study, has_record=False).result.metrics
     none = run_study(study.change(control__gain_factor=0.0), has_record=False).result.metrics
     assert np.max(found.peak_voltage) > 0.1 and np.max(none.peak_voltage) == 0
@@ -326,7 +319,7 @@ def test_drives_give_forces(monkeypatch, force, message):
         return force * error.position if np.shape(force) == (3,) else force
 
     monkeypatch.setitem(DRIVES._entries, "bad", DriveLaw("bad", "bad", answer))
-    study = parse_study(tomllib.loads(SMALL)).change(drive__kind="bad")
+    study = small(drive__kind="bad")
     with pytest.raises((StudyError, PartError), match=re.escape(message)):
         run_study(study, has_record=False)
 
@@ -336,14 +329,14 @@ def test_totals_are_numbers(monkeypatch):
     bad = Metric("bad", (), "m", "bad", (text,), lambda totals, ending: totals["text"])
     monkeypatch.setitem(METRICS._entries, "bad", bad)
     with pytest.raises(PartError, match="total 'text': 'x' after a sample; expected numbers"):
-        run_study(parse_study(tomllib.loads(SMALL)), has_record=False)
+        run_study(small(), has_record=False)
 
 
 @pytest.mark.parametrize("result", [None, ExportResult(None, None, None)])
 def test_targets_give_texts(monkeypatch, tmp_path, result):
     monkeypatch.setitem(TARGETS._entries, "bad", Target("bad", "bad", lambda job: result))
     with pytest.raises(StudyError, match="--target bad: it returns .*; expected an ExportResult"):
-        export_design(Design(paper_study(), {}), "bad", tmp_path / "out")
+        export_design(Design(small(), {}), "bad", tmp_path / "out")
 
 
 @pytest.mark.parametrize("value", [None, "a", 1j, np.array(["a"]), np.ones(2) * 1j])
@@ -360,7 +353,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxmodel.laws.contract import Law, modal_feedback
 from jaxmodel.metrics import Metric, Total
-from studies.export.job import ExportResult, check_loop
+from studies.export.job import ExportResult
 from studies.export.targets import Target
 from studies.space.methods import Method
 
@@ -384,8 +377,7 @@ methods = [
 ]
 
 def up(job):
-    loop = check_loop(job.exported, job.exported.channels, "")
-    return ExportResult({"../up.txt": ""}, loop, None)
+    return ExportResult({"../up.txt": ""}, None, None)
 
 targets = [Target("up", "up", up)]
 """
@@ -420,7 +412,7 @@ def wrong(tmp_path_factory):
 def test_own_parts_that_fail_are_named(wrong, changes, command, message, tmp_path, capsys):
     """In one line, and without a file."""
     method = changes.pop("sweep", "sobol")
-    study = parse_study(tomllib.loads(SMALL)).change(control__modes=2, **changes)
+    study = small(**changes)
     text = study_template(study)
     if command == "sweep":
         text += (

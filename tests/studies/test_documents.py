@@ -1,6 +1,6 @@
 """JSON documents: what every reading command prints with --json, and the schemas of all of them.
 
-The sweeps are made up; what runs is the shared machine of two modes.
+The sweeps are made up; what runs is a small study.
 """
 
 import copy
@@ -192,7 +192,7 @@ def test_a_run(document, tmp_path):
     free = uncontrolled_twin(again).result.metrics.residual_rms
     np.testing.assert_array_equal(found["without_control"]["residual_rms"], free)
     assert found["loop"]["gain_margin"] == pytest.approx(float(again.loop.gain_margin))
-    assert found["residual_length"] == 0.02
+    assert found["residual_length"] == 0.015
     assert set(found["metrics"]) | set(found["loop"]) == set(found["units"])
 
 

@@ -27,23 +27,18 @@ from studies.spillover import run as spillover_run
 from studies.sweeps import commands as sweep_commands
 from studies.tuning import audit as audit_module
 from studies.tuning.audit import ALLOWED, Disagreement, audit
+from tests.canonical import TINY, text_of
 from tests.studies.test_cli import run
 from tests.sweeps import small_spec
 from tests.tunings import tuning
 
 SILENT = Console(file=open(os.devnull, "w"))  # noqa: SIM115
-SWEEP = """
-[run]
-duration = 0.025
-[motion]
-waypoints = [[0, 0, 0.5236], [0, 0.002, 0.5236]]
-move_time = 0.01
-[metrics]
-residual_delay = 0.0
-residual_length = 0.005
-[sweep.axes]
-gain = { from = 0.1, to = 1.0, count = 6 }
-"""
+#: Without control there is no baseline to run.
+SWEEP = text_of(
+    TINY,
+    control={"feedback": "none"},
+    sweep={"axes": {"drive.kp": {"from": 1e4, "to": 4e4, "count": 6}}},
+)
 
 
 @pytest.fixture

@@ -9,10 +9,12 @@ import tempfile
 import pytest
 
 from studies.engine import sweep as sweeps
-from studies.engine.folder import LOCK, locked_folder
+from studies.engine.folder import BASELINE, LOCK, locked_folder
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.publish import working_folder
+from studies.store import write_store
+from tests.studies.test_exit_codes import Losing
 from tests.sweeps import small_spec
 
 
@@ -35,15 +37,17 @@ def test_a_folder_in_use_is_another_matter(tmp_path):
 
 
 def test_a_folder_removed_in_mid_run_ends_in_a_message(tmp_path, monkeypatch):
-    out, keep = tmp_path / "out", sweeps.keep_baseline
+    """Wherever the next file is written, here the baseline's; no case is run."""
+    out = tmp_path / "out"
 
-    def remove(*arguments):
-        shutil.rmtree(out)
-        keep(*arguments)
+    def remove(spec, table, folder, say):
+        shutil.rmtree(folder)
+        write_store(folder / BASELINE, {}, {})
 
     monkeypatch.setattr(sweeps, "keep_baseline", remove)
+    spec = small_spec({"axes": {"gain": [0.1, 0.5]}})
     with pytest.raises(StudyError, match="out/baseline.h5.*cannot write"):
-        run_sweep(small_spec({"axes": {"gain": [0.1, 0.5]}}), out, is_quiet=True)
+        run_sweep(spec, out, is_quiet=True, runner=Losing())
     assert not out.exists()
 
 

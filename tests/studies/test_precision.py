@@ -7,25 +7,25 @@ import numpy as np
 
 from jaxmodel import status
 from studies.engine.runs import run_study
-from tests.studies.engine.test_batch import short_study
+from tests.canonical import TINY, study_of
 
-CHANGES = {"link__modes": 2, "control__modes": 1, "shaper__kind": "zv"}
+STUDY = study_of(TINY, control__modes=1, control__gain_factor=0.1)
 SCRIPT = """
 import sys
 sys.path.insert(0, sys.argv[1])
-from studies.config import configure
-configure("float32")
+from studies import config
+config.configure("float32")
+config.keep_programs()
 from studies.engine.runs import run_study
-from tests.studies.engine.test_batch import short_study
-from tests.studies.test_precision import CHANGES
-result = run_study(short_study(**CHANGES), has_record=False, has_loop=False).result
+from tests.studies.test_precision import STUDY
+result = run_study(STUDY, has_record=False, has_loop=False).result
 rms = result.metrics.residual_rms
 print(rms.dtype, int(result.status), *map(float, rms.ravel()))
 """
 
 
 def test_float32_runs_and_agrees_with_float64(pytestconfig):
-    whole = run_study(short_study(**CHANGES), has_record=False, has_loop=False).result
+    whole = run_study(STUDY, has_record=False, has_loop=False).result
     assert whole.metrics.residual_rms.dtype == np.float64
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, str(pytestconfig.rootpath)],

@@ -35,9 +35,9 @@ from studies.reading import DEEPEST, LARGEST, open_hdf5, read_bytes, read_json, 
 from studies.study.spec import load_study
 
 #: Cases of each kind in the short campaign, and in the long one.
-SHORT = {"study": 45, "sweep": 35, "document": 30, "measurement": 25, "controller": 20}
-SHORT |= {"sweep folder": 6, "MATLAB file": 3, "fit folder": 25, "tuned folder": 10}
-SHORT |= {"chunks": 8, "program": 25, "outcome": 15, "scheduler": 10}
+SHORT = {"study": 25, "sweep": 20, "document": 20, "measurement": 15, "controller": 12}
+SHORT |= {"sweep folder": 4, "MATLAB file": 2, "fit folder": 14, "tuned folder": 6}
+SHORT |= {"chunks": 5, "program": 15, "outcome": 12, "scheduler": 8}
 LONG = {"study": 1200, "sweep": 1000, "tuning": 900, "fit": 900, "controller": 800, "gains": 300}
 LONG |= {"document": 800, "MATLAB file": 300, "measurement": 900, "sweep folder": 500}
 LONG |= {"tuning folder": 400, "commissioning": 600, "tuned folder": 500, "fit folder": 500}

@@ -24,29 +24,30 @@ from studies.engine import plan
 from studies.engine.chunks import LocalRunner
 from studies.engine.columns import NOT_RUN
 from studies.engine.folder import CHUNKS, SweepFolder, finished_cases, read_manifest
+from studies.engine.progress import Phases
 from studies.engine.results import read_sweep
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
-from studies.screen.run import run_screen
-from studies.screen.shards import screen_of
+from studies.screen.run import PHASES, ScreenProgress, ShardWork, run_screen
+from studies.screen.shards import screen_of, table_of
 from studies.screen.workers import ClusterScreener
 from studies.tuning.run import make_evaluator
 from studies.tuning.workers import ClusterEvaluator
-from tests.clusters import machines
+from tests.clusters import judged, machines
 from tests.studies.engine.test_sweeps import arrays, assert_same
 from tests.studies.test_cli import refused
-from tests.sweeps import MIXED, small_spec
+from tests.sweeps import MIXED, narrow_blocks, small_spec
 from tests.tunings import GAIN, tuning
 
-SPEC = small_spec(MIXED | {"blocks": [MIXED["blocks"][0] | {"count": 8}]})
+#: With noise as in the tests of the batch engine, whose programs these are.
+NOISE = {"electronics": {"adc_noise": 0.002}}
+SPEC = small_spec(MIXED | {"blocks": [MIXED["blocks"][0] | {"count": 8}]}, **NOISE)
 CASES = 144
 
 
 @pytest.fixture(autouse=True, scope="module")
 def small_chunks():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plan, "LANES", 8)
-        patch.setattr(plan, "LARGEST_CHUNK", 16)
+    with narrow_blocks(16):
         yield
 
 
@@ -86,9 +87,28 @@ def test_numbers_are_those_of_the_local_run(cluster, local, tmp_path):
     assert "workers: 2" in text and "144/144 cases" in text
 
 
-def test_a_screen_has_the_same_tally(cluster, tmp_path):
+def small_screen():
     sweep = {"method": "random", "count": 200, "axes": {"gain": {"from": 0.1, "to": 1.0}}}
-    screen = screen_of(small_spec(sweep), keep=9, shard_size=64)
+    return screen_of(small_spec(sweep), keep=9, shard_size=64)
+
+
+def test_shards_of_a_screen_come_back_with_their_own_tallies(cluster):
+    """Of all designs, which are not run: what runs them is that of sweeps."""
+    cluster.trouble(judged=True)
+    screen, stop = small_screen(), threading.Event()
+    with Phases(Console(quiet=True), PHASES, is_quiet=True) as phases:
+        phases.begin("screen")
+        work = ShardWork(screen, range(4), ScreenProgress(phases, 200, 0), stop)
+        there = dict(ClusterScreener(cluster.client, 60.0).tallies(work))
+    assert sorted(there) == [0, 1, 2, 3] and sum(x.n_designs for x in there.values()) == 200
+    for shard, found in there.items():
+        wanted = judged(screen, shard, table_of(screen, shard), stop)
+        jax.tree.map(np.testing.assert_array_equal, found, wanted)
+
+
+@pytest.mark.long  # in short: their tallies come back, and sweeps on workers have the same numbers
+def test_a_screen_has_the_same_tally(cluster, tmp_path):
+    screen = small_screen()
     tallies = []
     for name, screener in (("here", None), ("there", ClusterScreener(cluster.client, 60.0))):
         done = run_screen(screen, tmp_path / name, is_quiet=True, screener=screener)
@@ -119,7 +139,7 @@ def test_from_here_to_the_cluster_and_back(cluster, local, tmp_path):
             yield from islice(super().run(*arguments), 2)
 
     out = tmp_path / "out"
-    run_sweep(small_spec(), out, is_quiet=True)  # half of the cases
+    run_sweep(small_spec(**NOISE), out, is_quiet=True)  # half of the cases
     with pytest.raises(StudyError, match="disappeared"):
         run_sweep(SPEC, out, True, is_quiet=True, runner=Stopped(cluster.client, SPEC, 60.0))
     assert len(list((out / CHUNKS).glob("*.h5"))) == 2

@@ -23,9 +23,9 @@ from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.export.firmware import build as building
 from studies.show.document import schema
-from studies.study.spec import paper_study
 from studies.tuning.folder import open_tuning
 from studies.tuning.spec import parse_tuning
+from tests.canonical import MACHINE, TINY, study_of
 from tests.commissions import (
     margin_on,
     measured_data,
@@ -34,18 +34,17 @@ from tests.commissions import (
     with_control_of,
 )
 from tests.elements import margin_on_elements, residual_on_elements
-from tests.fits import RESPONSE, SHORT, blank
+from tests.fits import RESPONSE, blank
 from tests.pages import parsed, text_of
 from tests.studies.twin.test_twin import needs_exudyn
 
-STUDY = paper_study().change(link__modes=3)
+STUDY = study_of(MACHINE)
 MODES = {"kind": "modes", "frequency_hz": [114.0] * 3, "sigma_hz": 0.5}
 FREE = {"link.youngs_modulus": {"from": 60e9, "to": 80e9}}
 
 
 def data(**sections):
-    whole = {name: dict(x) for name, x in SHORT.items()}
-    return whole | {"fit": {"free": FREE, "data": [MODES]}} | sections
+    return TINY | {"fit": {"free": FREE, "data": [MODES]}} | sections
 
 
 # --- the file -------------------------------------------------------------------------------------
@@ -60,7 +59,7 @@ def data(**sections):
         ({"commission": {"margin": 2.0}}, "commission.margin"),
         ({"tune": {"scenarios": {"machines": {}}}}, "tune.scenarios.machines"),
         ({"tune": {"free": {"control.gain": {"from": 0.1, "to": 1.0}}}}, "tune.free.*control.gain"),
-        ({"control": {"feedback": "ideal"}}, "control.feedback"),
+        ({"control": TINY["control"] | {"feedback": "ideal"}}, "control.feedback"),
         ({"fit": {"free": {}, "data": [MODES]}}, "fit.free"),
     ],
 )
@@ -233,15 +232,16 @@ def test_a_stage_is_not_done_twice(monkeypatch, tmp_path):
         run_commission(parse_measured(other), tmp_path / "out", True)
 
 
-@pytest.mark.parametrize("name", ["fit/fit.json", "design.toml", "answers.json"])
-def test_a_changed_answer_is_refused(monkeypatch, name, tmp_path):
+def test_a_changed_answer_is_refused(monkeypatch, tmp_path):
     Pretended(monkeypatch)
     commissioned(tmp_path / "out")
-    with (tmp_path / "out" / name).open("a") as file:
-        file.write("x")
-    refused = pytest.raises(StudyError, match=f"{name}: damaged")
-    with refused:
-        run_commission(parse_measured(data()), tmp_path / "out", True)
+    for name in ("fit/fit.json", "design.toml", "answers.json"):
+        file = tmp_path / "out" / name
+        content = file.read_bytes()
+        file.write_bytes(content + b"x")
+        with pytest.raises(StudyError, match=f"{name}: damaged"):
+            run_commission(parse_measured(data()), tmp_path / "out", True)
+        file.write_bytes(content)
 
 
 def test_a_tuning_killed_before_its_first_iteration_begins_again(monkeypatch, tmp_path):

@@ -10,7 +10,7 @@ from jaxmodel.simulate import simulate
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import paper_study
 
-N_CASES = 64
+N_CASES = 16
 
 
 def short_study(**changes):
@@ -25,12 +25,17 @@ def short_study(**changes):
     return paper_study().change(**(short | changes))
 
 
+#: Those of `tests.canonical.MACHINE`.
+SIZES = {"run__duration": 0.05, "link__modes": 3}
+
+
 def mixed_case(rng):
     """Placement, mode counts, links, gains, shaper and geometry drawn at random."""
     first = rng.uniform(0.02, 0.05)
     centers = first + np.cumsum(np.r_[0, rng.uniform(0.035, 0.06, 2)])
     ratios = tuple((1.0, *rng.uniform(0, 0.3, 2)) for _ in range(3))
     study = short_study(
+        **SIZES,
         patches__centers=tuple(centers),
         control__links=tuple(bool(b) for b in rng.integers(0, 2, 3)),
         control__velocity_gain=tuple(rng.uniform(0.1, 0.6, 3)),
@@ -44,7 +49,7 @@ def mixed_case(rng):
     case = build_case(study)
     return as_arrays(
         case._replace(
-            n_modes=rng.integers(3, 9),
+            n_modes=rng.integers(2, 4),
             control=case.control._replace(n_active=float(rng.integers(1, 4))),
         )
     )
@@ -52,7 +57,7 @@ def mixed_case(rng):
 
 @pytest.fixture(scope="module")
 def structure():
-    return build_structure(short_study())
+    return build_structure(short_study(**SIZES))
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +127,7 @@ def test_order_and_neighbours_do_not_matter(cases, batch):
     whole = batch(stack(cases))
     order = np.random.default_rng(3).permutation(N_CASES)
     moved = batch(stack([cases[k] for k in order]))
-    other = batch(stack([*cases[:8], *([cases[40]] * (N_CASES - 8))]))
+    other = batch(stack([*cases[:8], *([cases[12]] * (N_CASES - 8))]))
     for name in ("residual_rms", "peak_voltage", "spectral_density"):
         x = np.asarray(getattr(whole.metrics, name))
         close = 1e-12 * np.abs(x).max()
@@ -148,7 +153,7 @@ def test_bad_members_are_frozen_and_alone(cases, batch):
     assert codes[2] == status.OUT_OF_REACH
     assert codes[3] == status.NON_FINITE
     assert codes[4] in (status.DIVERGED, status.OUT_OF_REACH, status.SINGULAR)
-    assert 0 < np.asarray(result.bad_time)[4] < 0.045
+    assert 0 < np.asarray(result.bad_time)[4] < 0.05
     good = np.r_[0, 5:N_CASES]
     assert np.all(codes[good] == status.OK)
     for a, b in zip(jax.tree.leaves(result.metrics), jax.tree.leaves(whole.metrics), strict=True):

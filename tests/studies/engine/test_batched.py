@@ -2,6 +2,7 @@
 
 import re
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -12,24 +13,28 @@ from jax.sharding import AxisType, PartitionSpec
 from jaxmodel import status
 from studies.engine import function
 from studies.engine.batched import batched
+from studies.engine.runs import run_study
 from studies.errors import StudyError
 from studies.kernels import bridge, native
 from studies.kernels.traced import InputLeaf, trace_loop
-from studies.study.spec import paper_study
+from tests.canonical import TINY, study_of
 
-STUDY = paper_study().change(
-    link__modes=2,
-    control__modes=2,
-    run__duration=0.06,
-    motion__waypoints=paper_study().motion.waypoints[:2],
-    motion__move_time=0.03,
-    metrics__residual_length=0.01,
-    metrics__residual_delay=0.002,
+#: One mode and one patch, which make small programs.
+STUDY = study_of(
+    TINY,
+    run__duration=0.05,
+    shaper__kind="ei",
+    link__modes=1,
+    patches__centers=[[0.1]] * 3,
+    control__modes=1,
+    control__ratios=[[1.0]] * 3,
 )
-
-
 #: Gains, a number of the shaper, which moves the reference, and a blow on all sliders.
 NAMES = ("control.gain_factor", "shaper.tolerance", "drive.pulse_force")
+
+
+#: What the study does not have: a wrench, friction and a position gain.
+MORE = ("load.wrench[0]", "drive.coulomb_friction", "control.position_gain[1]")
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +45,14 @@ def parameters():
 
 
 @pytest.fixture(scope="module")
+def wide(parameters):
+    """With numbers of what the study does not have in half of the cases."""
+    return np.concatenate([parameters, np.outer(np.arange(10) % 2, [2.0, 0.3, 40.0])], axis=1)
+
+
+@pytest.fixture(scope="module")
 def rounded():
-    return batched(STUDY, NAMES)
+    return batched(STUDY, (*NAMES, *MORE))
 
 
 @pytest.fixture(scope="module")
@@ -49,29 +60,34 @@ def smooth():
     return batched(STUDY.change(run__smooth=True), NAMES)
 
 
-def test_it_equals_the_scan(rounded, parameters, monkeypatch):
+@pytest.fixture(scope="module")
+def results(rounded, wide):
+    return jax.tree.map(np.asarray, jax.jit(rounded)(wide))
+
+
+def test_it_equals_the_scan(results, wide, monkeypatch):
     """Within 1e-9, status by status; ten cases do not fill the vectors."""
-    found = jax.jit(rounded)(parameters)
     monkeypatch.setattr(bridge, "is_available", lambda: False)
-    wanted = jax.jit(batched(STUDY, NAMES))(parameters)
-    np.testing.assert_array_equal(found.status, wanted.status)
-    assert set(np.asarray(found.status)) == {status.OK, status.DIVERGED}
-    good = np.asarray(found.status) == status.OK
-    for name, x in found.metrics.items():
+    wanted = jax.tree.map(np.asarray, jax.jit(batched(STUDY, (*NAMES, *MORE)))(wide))
+    np.testing.assert_array_equal(results.status, wanted.status)
+    assert set(results.status) == {status.OK, status.DIVERGED}
+    good = results.status == status.OK
+    for name, x in results.metrics.items():
         size = np.abs(wanted.metrics[name][good]).max()
         assert np.abs(x - wanted.metrics[name])[good].max() <= 1e-9 * size, name
         assert np.isnan(x[~good]).all()
 
 
-def test_it_runs_inside_other_programs(rounded, parameters):
-    whole = np.concatenate([parameters[4:8]] * 4)
+def test_it_runs_inside_other_programs(rounded, wide):
+    half = np.concatenate([wide[4:8], wide[6:10]])
+    whole = np.concatenate([half, half])
 
     def rms(x):
         return rounded(x).metrics.residual_rms
 
-    alone = np.asarray(rms(whole))
+    alone = np.concatenate([jax.jit(rms)(half)] * 2)
     assert alone.min() > 0
-    mapped = jax.jit(lambda x: jax.lax.map(rms, x))(whole.reshape(2, 8, 3))
+    mapped = jax.jit(lambda x: jax.lax.map(rms, x))(whole.reshape(2, 8, -1))
     np.testing.assert_allclose(mapped.reshape(alone.shape), alone, rtol=1e-12)
     mesh = jax.make_mesh((2,), ("cases",), axis_types=(AxisType.Auto,))
     spec = PartitionSpec("cases")
@@ -87,14 +103,20 @@ def sum_of_squares(function, x):
     return jnp.sum((1e6 * rms) ** 2)
 
 
-def test_derivatives_in_both_modes(smooth, parameters):
+@pytest.fixture(scope="module")
+def differentiated(smooth):
+    """The sum of squares and its gradient."""
+    return jax.jit(jax.value_and_grad(partial(sum_of_squares, smooth)))
+
+
+def test_derivatives_in_both_modes(smooth, differentiated, parameters):
     """Against differences; a case that is thrown off leaves the others alone."""
-    value = jax.jit(lambda x: sum_of_squares(smooth, x))
-    gradient = np.asarray(jax.jit(jax.grad(value))(parameters))
+    gradient = np.asarray(differentiated(parameters)[1])
     assert np.isfinite(gradient).all() and (gradient[3] == 0).all()
     step = np.zeros_like(parameters)
     step[4:, :2] = 1e-5 * parameters[4:, :2]
-    difference = (value(parameters + step) - value(parameters - step)) / 2
+    ends = [differentiated(parameters + sign * step)[0] for sign in (1, -1)]
+    difference, value = (ends[0] - ends[1]) / 2, partial(sum_of_squares, smooth)
     along = jax.jit(lambda x, dx: jax.jvp(value, (x,), (dx,))[1])(parameters, step)
     assert difference == pytest.approx(np.sum(gradient * step), rel=1e-6)
     assert along == pytest.approx(np.sum(gradient * step), rel=1e-9)
@@ -102,7 +124,7 @@ def test_derivatives_in_both_modes(smooth, parameters):
 
 
 @pytest.mark.long
-def test_jacobians_and_rounded_loops(rounded, smooth, parameters, monkeypatch):
+def test_jacobians_and_rounded_loops(smooth, parameters, monkeypatch):
     """Jacobians by both modes; a loop with converters has the derivatives of the scan's."""
     few = parameters[4:12]
 
@@ -112,6 +134,7 @@ def test_jacobians_and_rounded_loops(rounded, smooth, parameters, monkeypatch):
     forward, reverse = jax.jacfwd(rms)(few), jax.jacrev(rms)(few)
     np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-12 * np.abs(forward).max())
     assert (np.asarray(forward)[:, 1, :2] != 0).all() and (np.asarray(forward)[:, 2:] == 0).all()
+    rounded = batched(STUDY, NAMES)
     turned = jax.grad(lambda x: rounded(x).metrics.residual_rms.sum())(few)
     monkeypatch.setattr(bridge, "is_available", lambda: False)
     scan = batched(STUDY, NAMES)
@@ -143,9 +166,9 @@ def test_another_version_of_the_interface_is_left_alone(monkeypatch):
         ("abc", "not an array of numbers"),
     ],
 )
-def test_parameters_of_another_shape_are_refused(rounded, parameters, said):
+def test_parameters_of_another_shape_are_refused(smooth, parameters, said):
     with pytest.raises(StudyError, match=re.escape(said)):
-        rounded(parameters)
+        smooth(parameters)
 
 
 @pytest.mark.parametrize(
@@ -165,18 +188,18 @@ def test_a_wrong_name_is_refused(wrong, said):
         batched(STUDY, [*NAMES, wrong])
 
 
-def test_what_a_study_does_not_have_can_vary():
-    """A program for a study without wrench, friction or added damping takes them as names."""
-    names = ("load.wrench[0]", "drive.coulomb_friction", "control.position_gain[1]")
-    values = np.array([2.0, 0.3, 40.0])
+def test_what_a_study_does_not_have_can_vary(results, wide):
+    """A program for a study without wrench, friction or position gain takes them as names."""
+    gain, tolerance, _, wrench, friction, position = wide[5]
     given = STUDY.change(
-        load__wrench=(2.0, 0.0, 0.0),
-        drive__coulomb_friction=0.3,
-        control__position_gain=(0.0, 40.0, 0.0),
+        control__gain_factor=gain,
+        shaper__tolerance=tolerance,
+        load__wrench=(wrench, 0.0, 0.0),
+        drive__coulomb_friction=friction,
+        control__position_gain=(0.0, position, 0.0),
     )
-    found = batched(STUDY, names)(values[None]).metrics.residual_rms[0]
-    wanted = batched(given, ["drive.kp"])(np.array([[given.drive.kp]])).metrics.residual_rms[0]
-    np.testing.assert_allclose(found, wanted, rtol=1e-9)
+    wanted = run_study(given, has_record=False, has_loop=False).result.metrics.residual_rms
+    np.testing.assert_allclose(results.metrics.residual_rms[5], wanted, rtol=1e-9)
 
 
 def test_a_wrong_study_or_names_are_named():
@@ -186,17 +209,17 @@ def test_a_wrong_study_or_names_are_named():
         batched(STUDY, "drive.kp")
 
 
-def test_first_calls_from_several_threads(rounded, parameters):
+def test_first_calls_from_several_threads(rounded, wide):
     """XLA takes the name of a kernel once."""
-    with ThreadPoolExecutor(4) as pool:
-        one = list(pool.map(lambda _: np.asarray(rounded(parameters[:5]).status), range(4)))
+    with ThreadPoolExecutor(2) as pool:
+        one = list(pool.map(lambda _: np.asarray(rounded(wide[:5]).status), range(2)))
     assert all((x == one[0]).all() for x in one)
 
 
-def test_a_number_that_is_none_spoils_no_derivative(smooth, parameters):
+def test_a_number_that_is_none_spoils_no_derivative(differentiated, parameters):
     given = parameters.copy()
     given[5, 0] = np.nan
-    gradient = np.asarray(jax.jit(jax.grad(lambda x: sum_of_squares(smooth, x)))(given))
+    gradient = np.asarray(differentiated(given)[1])
     assert np.isfinite(gradient).all() and (gradient[5] == 0).all() and (gradient[4, :2] != 0).all()
 
 

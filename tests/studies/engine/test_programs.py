@@ -1,11 +1,14 @@
 """Programs kept on disk: found without being traced, and never mistaken for another."""
 
+import shutil
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxmodel.case import Structure
+from studies import sources
 from studies.engine import programs
 from studies.engine.programs import kept_data, kept_jit
 from studies.kernels import compilation
@@ -150,3 +153,42 @@ def test_only_commands_keep_programs(tmp_path, monkeypatch):
     scaled(Structure(n_modes=5), np.ones(2), 1.0)
     assert kept_data(["numbers"], lambda: 3, __name__) == 3
     assert not list(tmp_path.iterdir())
+
+
+def users_of_programs(top):
+    """Modules that keep programs, by what they import."""
+    kept = {f"{programs.__name__}.{name}" for name in ("kept_jit", "program")}
+    for package in sources.PACKAGES:
+        for path in (top / package).rglob("*.py"):
+            if kept & set(sources._imports(path)):
+                yield ".".join(path.relative_to(top).with_suffix("").parts)
+
+
+def test_a_word_in_a_report_leaves_all_programs_kept(tmp_path):
+    """And a change of the physics none: by copies of the packages with a file changed."""
+    for package in sources.PACKAGES:
+        shutil.copytree(
+            sources.TOP / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__")
+        )
+
+    def digests():
+        return {x: sources.digest(programs.__name__, x, top=tmp_path) for x in modules}
+
+    def changed(name):
+        path = tmp_path / name
+        text = path.read_bytes()
+        path.write_bytes(text + b"\n")
+        found = digests()
+        path.write_bytes(text)
+        return {x for x in modules if found[x] != before[x]}
+
+    modules = sorted(users_of_programs(tmp_path))
+    before = digests()
+    assert {"studies.engine.runs", "studies.engine.function", "studies.tuning.objective"} < {
+        *modules
+    }
+    assert programs.environment("studies.engine.runs")[0] == before["studies.engine.runs"]
+    reports = "studies/sweeps/report.py", "studies/show/words.py", "studies/tuning/report.html"
+    for name in reports:
+        assert not changed(name), name
+    assert changed("jaxmodel/beam.py") == {*modules}

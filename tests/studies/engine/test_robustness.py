@@ -12,47 +12,64 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 from scipy.optimize import brentq, minimize, minimize_scalar
+from threadpoolctl import threadpool_limits
 
 from jaxmodel.frequency_response import close_loop, command_gain
 from jaxmodel.linear import linearise, resting
 from jaxmodel.loop_figures import MARGINS, MOST_DELAY, PEAKS, guaranteed_range
 from jaxmodel.prepare import prepare
 from jaxmodel.robustness import _refined, coarse_norm, margin_at, norm_peaks, search_frequencies
-from jaxmodel.sampled_loop import analogue_plant, closed_loop, delayed_loop, delayed_parts
+from jaxmodel.sampled_loop import analogue_plant, closed_loop, delayed_loop
 from jaxmodel.scaling import best_scaling
 from studies.engine import diagonal_scaling
 from studies.engine.delay_check import DelayedLoops
 from studies.engine.loop_gain import loop_gains
 from studies.engine.margins import judge_loops
 from studies.engine.results import read_sweep
-from studies.engine.robustness import find_margins, judge_robustness, response_and_modes
-from studies.engine.stability import with_margin_modes
+from studies.engine.robustness import (
+    BATCH,
+    _responses,
+    find_margins,
+    judge_robustness,
+    response_and_modes,
+)
+from studies.engine.stability import _loops, with_margin_modes
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.space.spec import parse_sweep
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure
-from studies.study.spec import paper_study
 from studies.sweeps.show import ranked_cases
 from studies.tuning import loop_figures
 from studies.tuning.check import tuned_study
 from studies.tuning.linear_fidelity import LinearFidelity
 from studies.tuning.loop_figures import machine_figures, term_values
 from studies.tuning.spec import LOOP_TERMS
+from tests.canonical import MACHINE, study_of
 from tests.tunings import EACH, EVERY_KIND, GAIN, SMALL, tuning
 
 #: Off home, where nothing is symmetric.
 POSE = np.array([0.005, -0.003, 0.5])
-STUDY = paper_study()
+STUDY = study_of(MACHINE)
 PLANTS: dict[str, dict[str, Any]] = {
     "plain": {},
-    "loaded basis under load": {"load__wrench": (3.0, -2.0, 0.1), "link__basis": "loaded"},
-    "electronics, two links": {
+    "loaded basis under load, electronics, two links": {
+        "load__wrench": (3.0, -2.0, 0.1),
+        "link__basis": "loaded",
         "electronics__sensor_highpass_hz": 2.0,
         "electronics__amplifier_hz": 3000.0,
         "control__links": (True, False, True),
     },
     "no reaction of bending": {"run__model": "ked"},
 }
+#: Each of them with a law of its own: every one is a program.
+LAW_OF = dict(zip(PLANTS, ("imsc", "imsc", "lqg"), strict=True))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def serial():
+    """Matrices are too small for threads, which take turns at waiting for each other."""
+    with threadpool_limits(1, "blas"):
+        yield
 
 
 class Loop(NamedTuple):
@@ -71,18 +88,23 @@ class Loop(NamedTuple):
         return slice(len(self.matrices.open) - 3 * self.structure.n_patches, None)
 
 
-@partial(jax.jit, static_argnums=0)
-def _both(structure, case):
-    loop = prepare(structure, case).loop
-    return *response_and_modes(structure, case, loop, POSE), closed_loop(structure, case, POSE)
-
-
 @cache
 def loop_of(name: str, law: str = "imsc", factor: float = 0.5) -> Loop:
+    """By the programs that judge sweeps."""
     study = STUDY.change(**PLANTS[name], control__law=law, control__gain_factor=factor)
     structure, case = with_margin_modes(build_structure(study), as_arrays(build_case(study)))
-    response, modes, matrices = jax.tree.map(np.asarray, _both(structure, case))
-    return Loop(structure, case, response, modes, matrices, float(case.electronics.period))
+    case = posed(case, POSE)
+    every = jax.tree.map(lambda x: np.stack([x] * BATCH), case)
+    found = jax.tree.map(lambda x: np.asarray(x)[0], _responses(structure, False, every)[:2])
+    at_rest = _loops(structure, False, case, POSE, None).at_rest
+    matrices = jax.tree.map(lambda x: np.asarray(x)[0], at_rest)
+    return Loop(structure, case, *found, matrices, float(case.electronics.period))
+
+
+def posed(case: Any, pose: np.ndarray) -> Any:
+    """The same at rest at another pose."""
+    points = np.broadcast_to(pose, case.path.waypoints.shape)
+    return case._replace(path=case.path._replace(waypoints=points))
 
 
 def margins_of(loop: Loop, is_fine: bool = False) -> dict[str, float]:
@@ -92,6 +114,7 @@ def margins_of(loop: Loop, is_fine: bool = False) -> dict[str, float]:
 
 
 _peaks = jax.jit(norm_peaks, static_argnums=1)
+_gain = jax.jit(command_gain)
 
 
 def exact_gain(loop: Loop, omega: float) -> np.ndarray:
@@ -104,25 +127,22 @@ def exact_gain(loop: Loop, omega: float) -> np.ndarray:
 
 @pytest.mark.parametrize("name", PLANTS)
 def test_the_response_is_that_of_the_matrices(name):
-    loop = loop_of(name)
+    loop = loop_of(name, LAW_OF[name])
     for hertz in (3.0, 114.4, 457.0, 2000.0, 4400.0):
         omega = 2 * np.pi * hertz
-        found, wanted = command_gain(loop.response, omega), exact_gain(loop, omega)
+        found, wanted = _gain(loop.response, omega, 0.0), exact_gain(loop, omega)
         np.testing.assert_allclose(found, wanted, atol=1e-6 * np.abs(wanted).max())
 
 
-@pytest.mark.parametrize(
-    ("name", "law"), [*((name, "imsc") for name in PLANTS), ("plain", "lqr"), ("plain", "lqg")]
-)
+@pytest.mark.parametrize(("name", "law"), [*LAW_OF.items(), ("plain", "lqr")])
 def test_the_search_uses_the_same_response(name, law):
     """In NumPy, also with a further delay; 1e-4 with few images of the spectrum."""
     loop = loop_of(name, law)
     gains = loop_gains(jax.tree.map(lambda x: x[None], loop.response))
     omega = 2 * np.pi * np.array([3.0, 114.4, 457.0, 2000.0, 4400.0])
-    gain = jax.jit(lambda w, delay: command_gain(loop.response, w, delay))
     acting = np.ix_(gains.acting, gains.acting)
     for delay in (0.0, 0.3):
-        wanted = np.stack([np.asarray(gain(w, delay))[acting] for w in omega])
+        wanted = np.stack([np.asarray(_gain(loop.response, w, delay))[acting] for w in omega])
         scale = np.abs(wanted).max()
         late = np.full((1, len(omega)), delay)
         np.testing.assert_allclose(gains.exact(omega[None], late)[0], wanted, atol=1e-12 * scale)
@@ -130,15 +150,18 @@ def test_the_search_uses_the_same_response(name, law):
         np.testing.assert_allclose(found, wanted, atol=3e-4 * scale)
 
 
+_closed = jax.jit(close_loop)
+
+
 def test_the_closed_loop_is_that_of_the_matrices():
-    loop = loop_of("electronics, two links")
+    loop = loop_of("loaded basis under load, electronics, two links")
     m = loop.matrices
     for hertz in (114.4, 900.0):
         omega = 2 * np.pi * hertz
         z = np.exp(1j * omega * loop.period)
         closed = z * np.eye(len(m.open)) - m.open - m.feedback
         wanted = m.deflection @ np.linalg.solve(closed, m.force)
-        found = close_loop(loop.response, omega)
+        found = _closed(loop.response, omega)
         scale = np.abs(wanted).max()
         np.testing.assert_allclose(found.disturbance_deflection, wanted, atol=1e-6 * scale)
         gain = exact_gain(loop, omega)
@@ -278,38 +301,40 @@ ALIKE = {
     "name", [pytest.param(x, marks=pytest.mark.long if k else []) for k, x in enumerate(ALIKE)]
 )
 def test_no_delay_margin_is_missed(name):
-    study = STUDY.change(link__modes=3, **ALIKE[name])
+    study = STUDY.change(**ALIKE[name])
     structure = build_structure(study)
     cases = jax.tree.map(lambda x: x[None], as_arrays(build_case(study)))
     found = judge_robustness(structure, cases, ("delay_margin",), np.array([2.0]))
     structure, cases = with_margin_modes(structure, cases)
-    case = jax.tree.map(lambda x: x[0], cases)
+    case, margin = jax.tree.map(lambda x: x[0], cases), found["delay_margin"][0]
+    radii = [late_radius(structure, case, margin * x) for x in np.linspace(0.04, 0.99, 20)]
+    assert max(radii) < 1 < late_radius(structure, case, 1.01 * margin)
+
+
+def late_radius(structure: Any, case: Any, delay: float) -> float:
+    """Spectral radius of the loop under more delay."""
+    return radius(np.asarray(_late(structure, case, delay)))
+
+
+@partial(jax.jit, static_argnums=0)
+def _late(structure, case, delay):
     law = prepare(structure, case).loop.controller
-
-    @jax.jit
-    def late(delay):
-        return delayed_loop(structure, case, case.path.waypoints[0], law, delay)
-
-    margin = found["delay_margin"][0]
-    radii = [radius(np.asarray(late(margin * x))) for x in np.linspace(0.04, 0.99, 20)]
-    assert max(radii) < 1 < radius(np.asarray(late(1.01 * margin)))
+    return delayed_loop(structure, case, case.path.waypoints[0], law, delay)
 
 
 @pytest.mark.parametrize("kind", ["pd", "super_twisting"])
 def test_poles_of_a_later_loop_are_those_of_its_delay(kind):
     """A plant on a sampled drive moves freely, which has no eigenvectors of its own."""
-    study = STUDY.change(link__modes=3, drive__kind=kind)
-    structure = build_structure(study)
-    cases = jax.tree.map(lambda x: x[None], as_arrays(build_case(study)))
-    case = jax.tree.map(lambda x: x[0], cases)
-    law = prepare(structure, case).loop.controller
-    parts = delayed_parts(structure, case, prepare(structure, case).loop, case.path.waypoints[0])
-    each = jax.tree.map(lambda x: np.asarray(x)[None], parts)
-    loops = DelayedLoops.of(each, cases.electronics)
-    late = jax.jit(lambda x: delayed_loop(structure, case, case.path.waypoints[0], law, x))
+    study = STUDY.change(drive__kind=kind)
+    structure, case = with_margin_modes(build_structure(study), as_arrays(build_case(study)))
+    cases = jax.tree.map(lambda x: np.stack([x] * BATCH), case)
+    loops = DelayedLoops.of(_responses(structure, True, cases)[2], cases.electronics)
     for delay in (0.0, 0.3, 1.0, 2.625):
-        wanted = np.log(radius(np.asarray(late(delay))))
+        wanted = np.log(late_radius(structure, case, delay))
         assert loops.growth(0, delay) == pytest.approx(wanted, abs=1e-10)
+
+
+_best = jax.jit(best_scaling)
 
 
 def smallest_norm(matrix: np.ndarray) -> float:
@@ -335,7 +360,8 @@ def smallest_norm(matrix: np.ndarray) -> float:
 
 def test_a_peak_between_points_is_found_with_its_height():
     """Of a parabola; the height at the nearest point of an interval that is halved three times."""
-    place, height = _refined(lambda w: 3 - (w - 1.23) ** 2, jnp.linspace(0, 5, 11), 3)
+    refined = jax.jit(lambda w: _refined(lambda w: 3 - (w - 1.23) ** 2, w, 3))
+    place, height = refined(np.linspace(0, 5, 11))
     assert float(place) == pytest.approx(1.23, abs=1e-9)
     spacing = 1.0 / 4 / 2**3
     assert 3 - (spacing / 2) ** 2 <= float(height) <= 3
@@ -344,21 +370,23 @@ def test_a_peak_between_points_is_found_with_its_height():
 def test_a_coarse_norm_is_high_by_a_root_of_the_size_at_most():
     """Sixty-four powers of A'A: the trace has all n singular values, the norm one."""
     rng = np.random.default_rng(4)
-    for n in range(1, 8):
+    coarse = jax.jit(coarse_norm)
+    for n in (1, 2, 7):
         matrix = rng.normal(size=(n, n)) * 10.0**n + 1j * rng.normal(size=(n, n))
-        ratio = coarse_norm(matrix) / np.linalg.norm(matrix, 2)
+        ratio = coarse(matrix) / np.linalg.norm(matrix, 2)
         assert 1 - 1e-9 < ratio < n ** (1 / 128) + 1e-9
 
 
-def test_the_scaling_is_the_best_one():
+@pytest.mark.parametrize("sizes", [(3, 9), pytest.param((15,), marks=pytest.mark.long)])
+def test_the_scaling_is_the_best_one(sizes):
     rng = np.random.default_rng(1)
-    for n in (3, 9, 15):
+    for n in sizes:
         matrix = rng.normal(size=(n, n)) + 1j * rng.normal(size=(n, n))
         matrix *= np.exp(2 * rng.normal(size=(n, 1)))
-        found = jax.jit(best_scaling)(matrix)
+        found = _best(matrix)
         assert float(found.bound) == pytest.approx(smallest_norm(matrix), rel=1e-6)
         change = rng.normal(size=(n, n)) + 1j * rng.normal(size=(n, n))
-        ends = [float(best_scaling(matrix + h * change).bound) for h in (1e-5, -1e-5)]
+        ends = [float(_best(matrix + h * change).bound) for h in (1e-5, -1e-5)]
         slope = np.real(np.sum(np.conj(found.slope) * change))
         assert slope == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-4)
         searched, log = diagonal_scaling.best_scaling(matrix[None])
@@ -369,19 +397,18 @@ def test_the_scaling_is_the_best_one():
 
 def test_the_slope_of_a_bound_where_singular_values_coincide():
     """Of the best scaling, two of which are then largest, against differences."""
-    scaled = jax.jit(best_scaling)
     for seed, n in ((8, 3), (5, 4), (4, 6), (7, 6)):
         rng = np.random.default_rng(seed)
         matrix = rng.normal(size=(n, n)) * (1 - np.eye(n)) + 0.2 * (seed % 2) * np.eye(n)
-        found, change = scaled(matrix + 0j), rng.normal(size=(n, n))
+        found, change = _best(matrix + 0j), rng.normal(size=(n, n))
         x = np.asarray(found.log_scale)
         largest = np.linalg.svd(matrix * np.exp(x[:, None] - x))[1][:2]
         assert largest[1] == pytest.approx(largest[0], rel=1e-6)
-        ends = [float(scaled(matrix + h * change + 0j).bound) for h in (1e-5, -1e-5)]
+        ends = [float(_best(matrix + h * change + 0j).bound) for h in (1e-5, -1e-5)]
         slope = np.real(np.sum(np.conj(found.slope) * change))
         assert slope == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-3)
     # sqrt(m12 m21)
-    slope = scaled(np.array([[0, 4.0], [1.0, 0]]) + 0j).slope
+    slope = _best(np.array([[0, 4.0], [1.0, 0]]) + 0j).slope
     np.testing.assert_allclose(slope, [[0, 0.25], [1.0, 0]], rtol=1e-5, atol=1e-9)
 
 
@@ -397,7 +424,7 @@ def test_the_disk_margin_is_the_smallest_over_all_frequencies(law):
     def balanced(omega: float) -> float:
         return float(np.linalg.norm(diagonal_scaling.balanced(excess(omega)[None])[0], 2))
 
-    omega = np.asarray(search_frequencies(loop.response))
+    omega = np.asarray(jax.jit(search_frequencies)(loop.response))
     rough = np.array([balanced(x) for x in omega])
     peaks = np.argsort(-rough)[:12]
     exact = {k: float(_best(excess(omega[k])).bound) for k in peaks}
@@ -411,9 +438,6 @@ def test_the_disk_margin_is_the_smallest_over_all_frequencies(law):
     )
     assert found == pytest.approx(-1 / at.fun, rel=1e-6)
     assert smallest_norm(excess(at.x)) == pytest.approx(1 / found, rel=1e-6)
-
-
-_best = jax.jit(best_scaling)
 
 
 def test_no_perturbation_inside_the_disk_breaks_the_loop():
@@ -430,27 +454,27 @@ def test_no_perturbation_inside_the_disk_breaks_the_loop():
         assert radius(closed) < 1
 
 
-@pytest.mark.parametrize("name", PEAKS)
-def test_peaks_are_those_of_singular_values(name):
-    loop = loop_of("plain")
-    found = float(_peaks(loop.response, PEAKS)[name])
-    field = name.removesuffix("_peak")
+def test_peaks_are_those_of_singular_values():
+    loop, names = loop_of("plain"), [name.removesuffix("_peak") for name in PEAKS]
+    found = _peaks(loop.response, PEAKS)
 
     @jax.jit
-    def norm(omega):
-        matrix = getattr(close_loop(loop.response, omega), field)
-        return jnp.linalg.svd(matrix, compute_uv=False)[0]
+    def norms(omega):
+        closed = close_loop(loop.response, omega)
+        each = [jnp.linalg.svd(getattr(closed, x), compute_uv=False)[0] for x in names]
+        return jnp.stack(each)
 
     hertz = np.geomspace(0.5, 4990, 3000)
-    values = np.array(jax.lax.map(norm, 2 * np.pi * hertz))
-    peak = hertz[values.argmax()]
-    best = minimize_scalar(
-        lambda x: -float(norm(2 * np.pi * x)),
-        bounds=(peak * 0.99, peak * 1.01),
-        method="bounded",
-        options={"xatol": 1e-9},
-    )
-    assert found == pytest.approx(-best.fun, rel=1e-6)
+    values = np.array(jax.lax.map(norms, 2 * np.pi * hertz))
+    for k, name in enumerate(PEAKS):
+        peak = hertz[values[:, k].argmax()]
+        best = minimize_scalar(
+            lambda x, k=k: -float(norms(2 * np.pi * x)[k]),
+            bounds=(peak * 0.99, peak * 1.01),
+            method="bounded",
+            options={"xatol": 1e-9},
+        )
+        assert float(found[name]) == pytest.approx(-best.fun, rel=1e-6), name
 
 
 def test_a_delay_shortens_margins_by_its_share():
@@ -567,8 +591,14 @@ def test_no_margin_of_random_loops_is_too_large(law):
     cases = build_cases(study, columns, structure)
     structure, cases = with_margin_modes(structure, as_arrays(cases))
     cases = jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x)[1:])), cases)
-    both = jax.jit(jax.vmap(lambda case: (*_both(structure, case), _analogue(structure, case))))
-    response, modes, matrices, analogue = jax.tree.map(np.asarray, both(cases))
+
+    @jax.jit
+    @jax.vmap
+    def every(case):
+        found = response_and_modes(structure, case, prepare(structure, case).loop, POSE)
+        return *found, closed_loop(structure, case, POSE), _analogue(structure, case)
+
+    response, modes, matrices, analogue = jax.tree.map(np.asarray, every(cases))
     places = find_margins(response, modes, MARGINS)
     edges = is_early = 0
     for k in range(count):

@@ -19,7 +19,7 @@ from rich.console import Console
 
 import studies
 from jaxmodel import status
-from studies.engine import function, plan
+from studies.engine import function
 from studies.engine import sweep as run_module
 from studies.engine.design import deviation, load_design
 from studies.engine.folder import CHUNKS, finished_cases, make_manifest, open_folder
@@ -30,16 +30,24 @@ from studies.engine.sweep import make_plan, run_sweep
 from studies.errors import StudyError
 from studies.sweeps.show import case_rows, margin_warning, ranked_cases
 from tests import TOP
-from tests.sweeps import FAST_MOVE, MIXED, small, small_spec
+from tests.sweeps import FAST_MOVE, MIXED, narrow_blocks, small, small_spec
 
 SILENT = Console(file=open(os.devnull, "w"))  # noqa: SIM115
 
 
-@pytest.fixture(autouse=True)
-def small_chunks(monkeypatch):
+@pytest.fixture(scope="module", autouse=True)
+def small_chunks():
     """Chunks of 16 cases, so that a small sweep has several."""
-    monkeypatch.setattr(plan, "LANES", 8)
-    monkeypatch.setattr(plan, "LARGEST_CHUNK", 16)
+    with narrow_blocks(16):
+        yield
+
+
+#: Numbers of cases depend on seeds, so that a place in a chunk or a process for a seed would show.
+NOISE = {"electronics": {"adc_noise": 0.002}}
+
+
+def noisy_spec(sweep=MIXED):
+    return small_spec(sweep, **NOISE)
 
 
 def run(spec, out, **options):
@@ -50,12 +58,9 @@ def run(spec, out, **options):
 def mixed(tmp_path_factory):
     """Folder of a finished sweep of 72 cases, and how often its program was traced."""
     out = tmp_path_factory.mktemp("mixed") / "sweep"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plan, "LANES", 8)
-        patch.setattr(plan, "LARGEST_CHUNK", 16)
-        patch.setattr(function, "_FUNCTIONS", {})  # of other tests
-        before = len(TRACES)
-        outcome = run(small_spec(), out)
+    function._FUNCTIONS.clear()  # of other tests
+    before = len(TRACES)
+    outcome = run(noisy_spec(), out)
     assert outcome.n_done == outcome.n_run == 72
     return out, len(TRACES) - before
 
@@ -119,9 +124,13 @@ def test_results_open_in_xarray_and_in_plain_hdf5(mixed):
 
 
 def test_equal_sweeps_have_equal_datasets(mixed, tmp_path):
-    folder, _ = mixed
-    run(small_spec(), tmp_path / "again")
-    assert_same(arrays(folder), arrays(tmp_path / "again"), 0.0)
+    """In a background thread, too: signals can be caught in the main thread only."""
+    found = []
+    thread = threading.Thread(target=lambda: found.append(run(noisy_spec(), tmp_path / "again")))
+    thread.start()
+    thread.join()
+    assert found[0].n_done == 72
+    assert_same(arrays(mixed[0]), arrays(tmp_path / "again"), 0.0)
 
 
 def test_impossible_cases_do_not_touch_the_others(tmp_path):
@@ -256,6 +265,7 @@ import json, os, sys
 sys.path.insert(0, sys.argv[3])
 import studies
 studies.configure()
+studies.config.keep_programs()
 from pathlib import Path
 from studies.engine import plan
 from studies.engine.sweep import run_sweep
@@ -277,7 +287,7 @@ def started(data, out):
 def test_a_killed_sweep_runs_only_what_is_left(tmp_path, mixed):
     """Kills at random moments, of all commands: campaigns/test_kills.py."""
     out = tmp_path / "killed"
-    process = started(small(), out)
+    process = started(small(**NOISE), out)
     deadline = time.monotonic() + 120
     while not list(out.glob("*/*.h5")) and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.002)
@@ -285,14 +295,14 @@ def test_a_killed_sweep_runs_only_what_is_left(tmp_path, mixed):
     process.communicate(timeout=120)
     done = finished_cases(out).case_id
     assert 0 < len(done) < 72
-    outcome = run(small_spec(), out, is_resumed=True)
+    outcome = run(noisy_spec(), out, is_resumed=True)
     assert outcome.n_done == 72 and outcome.n_run == 72 - len(done)
     assert_same(arrays(mixed[0]), arrays(out))
 
 
 def partly_done(out, spec=None, number=signal.SIGINT):
     """A sweep that stopped after two chunks, as Ctrl-C leaves it."""
-    spec = spec or small_spec()
+    spec = spec or noisy_spec()
     from studies.engine import sweep as module
 
     original, count = module.SweepFolder.write_chunk, [0]
@@ -305,30 +315,31 @@ def partly_done(out, spec=None, number=signal.SIGINT):
             time.sleep(0.01)
 
     module.SweepFolder.write_chunk = write
+    before = signal.getsignal(number)  # a shell starts what runs in its background without
     try:
-        return run(spec, out)
+        outcome = run(spec, out)
     finally:
         module.SweepFolder.write_chunk = original
+    assert outcome.is_interrupted and signal.getsignal(number) is before
+    return outcome
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["ctrl-c", "batch"])
-def test_a_signal_finishes_the_chunk_and_says_so(tmp_path, mixed, number):
+def test_a_signal_finishes_the_chunk_and_says_so(tmp_path, mixed):
+    """Ctrl-C; of a batch system: the next test."""
     out = tmp_path / "s"
-    before = signal.getsignal(number)  # a shell starts what runs in its background without
-    outcome = partly_done(out, number=number)
-    assert outcome.is_interrupted and 32 <= outcome.n_done < 72
-    assert signal.getsignal(number) is before
+    outcome = partly_done(out)
+    assert 32 <= outcome.n_done < 72
     data = read_sweep(out)
     assert np.sum(data["status"] >= 0) == outcome.n_done
     assert np.isnan(data["residual_rms"][data["status"] < 0]).all()
-    resumed = run(small_spec(), out, is_resumed=True)
+    resumed = run(noisy_spec(), out, is_resumed=True)
     assert resumed.n_run == 72 - outcome.n_done
     assert_same(arrays(mixed[0]), arrays(out))
 
 
 def test_damaged_chunks_run_again(tmp_path, mixed):
     out = tmp_path / "s"
-    partly_done(out)
+    partly_done(out, number=signal.SIGTERM)
     chunks = sorted((out / CHUNKS).glob("*.h5"))
     content = bytearray(chunks[0].read_bytes())
     content[len(content) // 2] ^= 1
@@ -336,7 +347,7 @@ def test_damaged_chunks_run_again(tmp_path, mixed):
     chunks[1].write_bytes(chunks[1].read_bytes()[:1000])
     (out / CHUNKS / "unfinished.tmp").write_bytes(b"half")
     before = len(finished_cases(out).case_id)
-    resumed = run(small_spec(), out, is_resumed=True)
+    resumed = run(noisy_spec(), out, is_resumed=True)
     assert resumed.n_run == 72 - before >= 32
     assert_same(arrays(mixed[0]), arrays(out))
     assert len(list((out / CHUNKS).glob("*.damaged"))) == 2
@@ -353,61 +364,62 @@ def test_chunks_lost_while_it_runs_are_noticed(tmp_path, monkeypatch):
 
     monkeypatch.setattr(run_module, "finished_cases", lossy)
     with pytest.raises(StudyError, match="16 of 72 cases disappeared while the sweep ran"):
-        run(small_spec(), out)
+        run(noisy_spec(), out)
     monkeypatch.undo()
     assert not (out / "results.h5").exists()
 
 
 def test_extended_sweep_runs_only_new_cases(tmp_path):
     def spec(count, modes):
-        axes = {"controlled_modes": modes, "plant_modes": [3], "link_subsets": ["1"]}
+        axes = MIXED["axes"] | {"controlled_modes": modes, "link_subsets": ["1", "1+2+3"]}
         inner = MIXED["blocks"][0] | {"count": count}
-        return small_spec({"axes": axes, "blocks": [inner]})
+        return noisy_spec({"axes": axes, "blocks": [inner]})
 
-    out = tmp_path / "s"
-    run(spec(8, [2, 3]), out)
-    with open_folder(out, make_manifest(spec(16, [1, 2, 3]).data), True) as folder:
-        folder.begin(make_manifest(spec(16, [1, 2, 3]).data))
+    out, longest = tmp_path / "s", spec(4, [1, 2, 3])
+    run(spec(2, [2, 3]), out)
+    with open_folder(out, make_manifest(longest.data), True) as folder:
+        folder.begin(make_manifest(longest.data))
     begun = read_sweep(out)  # stopped before the first chunk: old cases are known by their ids
     assert begun.n_cases == 48 and np.sum(begun["status"] >= 0) == 16
-    case = int(np.flatnonzero(begun["status"] >= 0)[3])
+    is_full = (begun["link.modes"] == 3) & (begun["control.modes"] == 3)  # a program of replays
+    case = int(np.flatnonzero((begun["status"] >= 0) & is_full)[1])
     found = run_study(load_design(out, case).study, has_record=False, has_loop=False)
     assert deviation(found, load_design(out, case).stored)[0] < 1e-9
-    longer = run(spec(16, [1, 2, 3]), out, is_resumed=True)
+    longer = run(longest, out, is_resumed=True)
     assert longer.n_run == 48 - 16 and longer.n_done == 48
-    run(spec(16, [1, 2, 3]), tmp_path / "whole")
+    run(longest, tmp_path / "whole")
     assert_same(arrays(tmp_path / "whole"), arrays(out), 1e-9)
-    other = spec(16, [1, 2, 3])
+    other = spec(4, [1, 2, 3])
     other.data["sweep"]["metrics"] = ["residual_rms"]
     with pytest.raises(StudyError, match="keeps the same"):
         run(other, out, is_resumed=True)
     before = (out / "sweep.json").read_bytes()
     with pytest.raises(StudyError, match="finished cases in .* are not part of this sweep"):
-        run(spec(8, [2, 3]), out, is_resumed=True)
+        run(spec(2, [2, 3]), out, is_resumed=True)
     assert (out / "sweep.json").read_bytes() == before
 
 
 def test_what_does_not_fit_is_refused(tmp_path, mixed):
     folder, _ = mixed
     with pytest.raises(StudyError, match="holds a sweep already; add --resume"):
-        run(small_spec(), folder)
+        run(noisy_spec(), folder)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tmp").write_text("x")
     with pytest.raises(StudyError, match="holds other files .thesis.tmp."):
-        run(small_spec(), tmp_path / "other")
+        run(noisy_spec(), tmp_path / "other")
     with pytest.raises(StudyError, match="holds other files .thesis.tmp."):
-        run(small_spec(), tmp_path / "other", is_resumed=True)
+        run(noisy_spec(), tmp_path / "other", is_resumed=True)
     assert [x.name for x in (tmp_path / "other").iterdir()] == ["thesis.tmp"]
     (tmp_path / "file").write_text("x")
     with pytest.raises(StudyError, match="this is a file; name a folder"):
-        run(small_spec(), tmp_path / "file")
+        run(noisy_spec(), tmp_path / "file")
     copy = tmp_path / "copy"
     shutil.copytree(folder, copy)
     text = (copy / "sweep.json").read_text()
     digest = text.split('"code": "')[1][:16]
     (copy / "sweep.json").write_text(text.replace(digest, "0" * 16))
     with pytest.raises(StudyError, match="begun with another code"):
-        run(small_spec(), copy, is_resumed=True)
+        run(noisy_spec(), copy, is_resumed=True)
     content = bytearray((copy / "results.h5").read_bytes())
     content[len(content) // 3] ^= 1
     (copy / "results.h5").write_bytes(content)
@@ -439,7 +451,7 @@ def test_full_disk_keeps_what_is_finished(tmp_path, mixed):
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, old[1]))
     try:
         with pytest.raises(StudyError, match="cannot write"):
-            run(small_spec(), out / "s")
+            run(noisy_spec(), out / "s")
         kept = len(finished_cases(out / "s").case_id)
         assert not list((out / "s" / CHUNKS).glob("*.tmp"))
         if is_mounted:
@@ -447,7 +459,7 @@ def test_full_disk_keeps_what_is_finished(tmp_path, mixed):
             subprocess.run(["mount", "-o", "remount,size=8m", str(out)], check=True, timeout=120)
         else:
             resource.setrlimit(resource.RLIMIT_FSIZE, old)
-        assert run(small_spec(), out / "s", is_resumed=True).n_run == 72 - kept
+        assert run(noisy_spec(), out / "s", is_resumed=True).n_run == 72 - kept
         assert_same(arrays(mixed[0]), arrays(out / "s"))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, old)
@@ -496,15 +508,6 @@ def test_small_margins_are_not_passed_over(mixed):
     assert (fine == "") == (data["gain_margin"].max() >= 2)
     table = case_rows(data, order[:1], ["residual_rms"])
     assert table.heads[-1] == "gain_margin" and float(table.rows[0][-1]) < 2
-
-
-def test_background_threads_may_run_sweeps(tmp_path):
-    """Signals can be caught in the main thread only; elsewhere a sweep runs without."""
-    found = []
-    thread = threading.Thread(target=lambda: found.append(run(small_spec(), tmp_path / "s")))
-    thread.start()
-    thread.join()
-    assert found[0].n_done == 72
 
 
 LOADED = (

@@ -107,8 +107,15 @@ def test_the_papers_study_at_full_size(capsys, tmp_path, target):
     assert abs(loss) < (100 * AIM if target == "c-fixed" else 1e-6)
 
 
-@pytest.mark.parametrize("name", DESIGNS)
-@pytest.mark.parametrize("target", ["c", "c-fixed"])
+@pytest.mark.parametrize(
+    "name, target",
+    [
+        ("single", "c"),
+        ("tuned", "c-fixed"),
+        *(pytest.param(*x, marks=pytest.mark.long) for x in (("paper", "c"), ("tuned", "c"))),
+        *(pytest.param(x, "c-fixed", marks=pytest.mark.long) for x in ("paper", "single")),
+    ],
+)
 def test_code_compiles_as_cpp_and_under_more_warnings(
     capsys, designs, folders, name, target, tmp_path
 ):
@@ -169,9 +176,7 @@ def fuzz(out, target, folder, samples, seeds, single=False):
         assert re.fullmatch(rf"{samples} samples, [1-9]\d* faults\n", done.stdout)
 
 
-@pytest.mark.parametrize(
-    "name, target", [("single", "c"), ("single", "c-fixed"), ("tuned", "c-fixed")]
-)
+@pytest.mark.parametrize("name, target", [("single", "c"), ("tuned", "c-fixed")])
 def test_fuzzing_finds_nothing(capsys, designs, folders, name, target, tmp_path):
     out, _ = exported(capsys, designs, folders, name, target)
     fuzz(out, target, tmp_path, 100_000, 1)

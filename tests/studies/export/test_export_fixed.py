@@ -231,7 +231,6 @@ UNFIT = {
         changed(
             PAPER,
             electronics={"sample_rate_hz": 1e6, "antialias_hz": 2e5, "highpass_hz": 5.0},
-            run={"duration": 0.08},
         ),
         "electronics.sample_rate_hz = 1e",
     ),

@@ -6,25 +6,32 @@ import re
 import numpy as np
 import pytest
 
-from studies.fitting.diagnosis import BETTER, diagnose
+from studies.fitting.diagnosis import BETTER, _of_data, diagnose
 from studies.fitting.estimate import fit
 from studies.fitting.faults import fault_of
-from studies.fitting.problem import Problem
 from studies.fitting.report import sentences
 from studies.fitting.solve import descend
+from studies.fitting.statistics import describe_fit
 from tests.fits import (
-    FREE,
+    DECAY,
+    FREE_OF_UNEQUAL,
     FREQUENCY,
     MAGNITUDE,
     MODES,
     RESPONSE,
+    SENSORS,
     SPECTRUM,
     TRACE,
+    UNEQUAL,
+    Ringing,
     blank,
+    followed,
     give_data,
     made,
+    posed,
     spec_of,
     write,
+    write_decays,
 )
 
 SIGNALS = [
@@ -32,48 +39,63 @@ SIGNALS = [
     ("actuator 2.2", "sensor 2.3"),
     ("slider 3", "sensor 3.1"),
 ]
-TRUE = np.array([66e9, 0.009, 0.27])
-FREED = {name: FREE[name] for name in ("link.youngs_modulus", "link.damping_ratio")}
+LINES, NOISE = FREQUENCY[::3], 0.01
+TRUE = np.array([0.94, 0.009])
 
 
 def entries():
+    exact = RESPONSE | {"sigma_percent": 100 * NOISE}
     return [
-        RESPONSE | {"name": f"response {k + 1}", "input": a, "output": b, "file": f"r{k}.csv"}
+        exact | {"name": f"response {k + 1}", "input": a, "output": b, "file": f"r{k}.csv"}
         for k, (a, b) in enumerate(SIGNALS)
     ]
+
+
+def asked(folder, *entries):
+    return spec_of(folder, *entries, free=FREE_OF_UNEQUAL, study=UNEQUAL)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("data")
     blank(path)
-    one = np.ones(len(FREQUENCY))
+    one = np.ones(len(LINES))
     for k in range(len(SIGNALS)):
-        write(path, f"r{k}.csv", frequency_hz=FREQUENCY, real=one, imag=one)
+        write(path, f"r{k}.csv", frequency_hz=LINES, real=one, imag=one)
     return path
 
 
 @pytest.fixture(scope="module")
-def measured(folder):
-    """Specification, bench and noisy responses of the true machine."""
-    spec = spec_of(folder, *entries())
-    bench, every, _ = made(spec)
+def bench(folder):
+    """The machine, whose programs all tests here share."""
+    return made(asked(folder, *entries()))[0]
+
+
+@pytest.fixture(scope="module")
+def measured(folder, bench):
+    """Specification and problem with noisy responses of the true machine."""
+    spec = asked(folder, *entries())
+    problem = posed(spec, bench)
     rng = np.random.default_rng(0)
-    for one in every:
+    for one in problem.measurements:
         exact, _ = one.predict(TRUE, False)
         one.reweigh(TRUE)
-        one.sigma = np.hypot(0.03 * np.abs(exact), 1e-5)
+        one.sigma = np.hypot(NOISE * np.abs(exact), 1e-5)
         one.measured = exact + one.sigma * (rng.normal(size=(2, len(exact))).T @ [1, 1j])
-    return spec, bench, every
+    return spec, problem
+
+
+def spoilt_fit(problem, spoilt):
+    """A fit in which some measurements are spoilt, by functions of number and measurement."""
+    every = [spoilt(k, copy.copy(one)) for k, one in enumerate(problem.measurements)]
+    problem = problem._replace(measurements=tuple(every))
+    return problem, descend(problem, problem.free.places(), 40).u
 
 
 def diagnosed(measured, spoilt):
-    """Remedies of a fit in which some responses are spoilt, by functions of number and response."""
-    spec, bench, every = measured
-    every = [spoilt(k, copy.copy(one)) for k, one in enumerate(every)]
-    problem = Problem(spec.free, spec.priors, tuple(every), bench)
-    optimum = descend(problem, problem.free.places(), 40)
-    return diagnose(spec, problem, optimum.u)
+    """All remedies of such a fit."""
+    spec, problem = measured
+    return diagnose(spec, *spoilt_fit(problem, spoilt))
 
 
 def scaled(one, factor):
@@ -119,11 +141,11 @@ FAULTS = {
 @pytest.mark.parametrize("name", FAULTS)
 def test_the_fault_of_the_data_is_named(measured, name):
     spoilt, text, size = FAULTS[name]
-    best = diagnosed(measured, spoilt)[0]
+    (best,) = _of_data(*spoilt_fit(measured[1], spoilt))
     found = re.match(text, best.text)
     assert found, best.text
     assert size is None or float(found[1]) == pytest.approx(size, rel=0.02)
-    count = 2 * len(FREQUENCY) * len(SIGNALS)
+    count = 2 * len(LINES) * len(SIGNALS)
     assert best.after < 1.3 * count and best.before > 3 * best.after
 
 
@@ -134,11 +156,15 @@ def test_exchanged_channels_are_named(measured):
             true.signals = one.signals[0], one.signals[1]._replace(patch=1)
             exact, _ = true.predict(TRUE, False)
             noise = one.measured / one.predict(TRUE, False)[0]
-            one.measured, one.sigma = exact * noise, np.hypot(0.03 * np.abs(exact), 1e-5)
+            one.measured, one.sigma = exact * noise, np.hypot(NOISE * np.abs(exact), 1e-5)
         return one
 
     best = diagnosed(measured, swapped)[0]
     assert best.text == "response 2: its sensor is 2.2"
+
+
+#: Of parameters of traces.
+GUESS = np.array([66e9, 0.009, 0.27])
 
 
 def moved(one, delay):
@@ -149,11 +175,10 @@ def moved(one, delay):
 def of_another_sensor(one):
     other = copy.copy(one)
     other.signal = one.signal._replace(link=2)
-    one.measured = one.measured + other.predict(TRUE, False)[0] - one.predict(TRUE, False)[0]
+    one.measured = one.measured + other.predict(GUESS, False)[0] - one.predict(GUESS, False)[0]
     return one
 
 
-MOVED = TRACE | {"sigma": 0.05}
 BENDING = SPECTRUM | {"input": "actuator 1.1", "output": "sensor 1.2"}
 #: Kind, what is done to it, and what is said of it; beside a sound response.
 OTHER_KINDS = [
@@ -163,38 +188,60 @@ OTHER_KINDS = [
     (BENDING, in_radians, "other: its frequencies are in rad/s"),
     (MODES, lambda x: x.stretched(2 * np.pi), "other: its frequencies are in rad/s"),
     (MODES, lambda x: x.stretched(1.0, 100.0), "other: its damping ratios are in percent"),
-    (MOVED, lambda x: scaled(x, -1.0), "other: its polarity is reversed"),
-    (MOVED, lambda x: scaled(x, 9.80665), "other: it is too large by a factor of 9.81"),
-    (MOVED, lambda x: moved(x, 3e-4), r"other: it is late by 0\.(29|30|31)\d* ms"),
-    (MOVED, of_another_sensor, r"other: its sensor is 3\.2"),
 ]
 
 
-@pytest.fixture(scope="module")
-def kinds(folder):
-    """By kind of the other entry: specification, bench and measurements of the true machine."""
-    return {}
-
-
 @pytest.mark.parametrize("entry, spoil, said", OTHER_KINDS)
-def test_faults_of_other_kinds_are_named(folder, kinds, entry, spoil, said):
-    if entry["kind"] not in kinds:
-        sound = RESPONSE | {"sigma_percent": 0.3, "sigma": 1e-6}
-        pair = [sound, entry | {"name": "other"}]
-        spec = spec_of(folder, *pair)
-        bench, every, _ = made(spec)
-        rng = np.random.default_rng(0)
-        for one in every:
-            give_data(bench, one, TRUE, rng)
-        kinds[entry["kind"]] = spec, bench, every
-    spec, bench, every = kinds[entry["kind"]]
-    if entry["kind"] == "trace":  # whose fits take long: at the true machine
-        one = spoil(copy.copy(every[1]))
-        fault = fault_of(one, TRUE, BETTER)
-        assert re.match(said, f"other: {fault.text.format(fault.size)}"), fault.text
-        return
-    best = diagnosed((spec, bench, every), only(1, spoil))[0]
+def test_faults_of_other_kinds_are_named(folder, bench, entry, spoil, said):
+    sound = RESPONSE | {"sigma_percent": 0.3, "sigma": 1e-6}
+    problem = posed(asked(folder, sound, entry | {"name": "other"}), bench)
+    rng = np.random.default_rng(0)
+    for one in problem.measurements:
+        give_data(bench, one, TRUE, rng)
+    (best,) = _of_data(*spoilt_fit(problem, only(1, spoil)))
     assert re.match(said, best.text), best.text
+
+
+@pytest.mark.parametrize(
+    "spoil, said",
+    [
+        (lambda x: scaled(x, -1.0), "its polarity is reversed"),
+        (lambda x: scaled(x, 9.80665), "it is too large by a factor of 9.81"),
+        (lambda x: moved(x, 3e-4), r"it is late by 0\.(29|30|31)\d* ms"),
+        (of_another_sensor, r"its sensor is 3\.2"),
+    ],
+)
+def test_faults_of_traces_are_named(folder, bench, spoil, said):
+    """At the true machine: their fits take long."""
+    _, (one,), _ = made(spec_of(folder, TRACE | {"sigma": 0.05}), bench)
+    one._motion = Ringing()
+    give_data(bench, one, GUESS, np.random.default_rng(0))
+    fault = fault_of(spoil(one), GUESS, BETTER)
+    assert re.match(said, fault.text.format(fault.size)), fault.text
+
+
+def of_decays(folder, bench, study, **entry):
+    """The best remedy of a fit that does not explain a record of decays."""
+    write_decays(folder, bench, np.array([1.0, 0.012]))
+    entry = DECAY | {"name": "decay", "segment_s": 0.5} | entry
+    spec = spec_of(folder, entry, free=FREE_OF_UNEQUAL, study=study)
+    problem = posed(spec)
+    u = followed(problem)
+    assert not describe_fit(problem, u).is_explained
+    return diagnose(spec, problem, u)[0].text
+
+
+def test_exchanged_channels_of_a_record_are_named(folder, bench):
+    """The cables of two sensors: shapes and frequencies no longer belong together."""
+    exchanged = [SENSORS[1], SENSORS[0], SENSORS[2]]
+    text = of_decays(folder, bench, UNEQUAL, values=exchanged)
+    assert text == "decay: sensor 1.1 and sensor 2.1 are exchanged"
+
+
+def test_links_that_differ_are_named(folder, bench):
+    """Three unequal links, fitted as equal ones."""
+    equal = {"link": UNEQUAL["link"] | {"youngs_modulus": [70e9] * 3}}
+    assert "the links differ in link.stiffness_factor" in of_decays(folder, bench, equal)
 
 
 def test_good_data_have_no_remedy(measured):
@@ -202,17 +249,17 @@ def test_good_data_have_no_remedy(measured):
 
 
 def test_the_fixed_field_that_is_wrong_is_named(folder, measured):
-    """A platform of 0.27 kg, held at 0.15 kg in the fit of two other parameters."""
-    for k, one in enumerate(measured[2]):
+    """A platform of 0.25 kg, held at 0.14 kg in the fit of two other parameters."""
+    for k, one in enumerate(measured[1].measurements):
         parts = {"real": one.measured.real, "imag": one.measured.imag}
-        write(folder, f"r{k}.csv", frequency_hz=FREQUENCY, **parts)
-    light = {"machine": {"platform_mass": 0.15}}
+        write(folder, f"r{k}.csv", frequency_hz=LINES, **parts)
+    study = UNEQUAL | {"machine": {"platform_mass": 0.14}}
     options = {"starts": 2, "refine": 1, "profile": False}
-    found = fit(spec_of(folder, *entries(), free=FREED, study=light, **options))
+    found = fit(spec_of(folder, *entries(), free=FREE_OF_UNEQUAL, study=study, **options))
     assert not found.answer.is_explained
     (text,) = (x.text for x in found.remedies if x.text.startswith("machine.platform_mass"))
-    value = float(re.fullmatch(".*, which is fixed at 0.15, is (.*) kg", text)[1])
-    assert value == pytest.approx(0.27, rel=0.02)
+    value = float(re.fullmatch(".*, which is fixed at 0.14, is (.*) kg", text)[1])
+    assert value == pytest.approx(0.25, rel=0.02)
     best = found.remedies[0]  # a payload would do as well
     assert best.text.startswith(("machine.platform_mass", "load.mass, which is fixed at 0,"))
     assert any(text in line for line in sentences(found))

@@ -5,22 +5,36 @@ import pytest
 
 from studies.errors import StudyError
 from studies.fitting.bench import Bench, response
-from studies.fitting.estimate import fit
+from studies.space.free import join_numbers
 from studies.study.cases import build_case, build_structure
 from studies.study.signals import OUTPUTS, Signal, parse_signal, signal_name
-from studies.study.spec import paper_study
 from studies.twin.chain import close_chain
 from studies.twin.machine import describe_machine
-from tests.fits import ACCELEROMETER, ASKEW, FREQUENCY, MOTOR, TRACE, made, spec_of, write
+from tests.canonical import study_of
+from tests.fits import (
+    ACCELEROMETER,
+    ASKEW,
+    FREQUENCY,
+    MOTOR,
+    SHORT,
+    TRACE,
+    answered,
+    blank,
+    give_data,
+    made,
+    posed,
+    spec_of,
+    write,
+)
 
-STUDY = paper_study().change(link__modes=4)
+STUDY = study_of(SHORT)
 NONE = np.nan
 END = 0.19999  # of a link [m], just before its joint
 
 
 @pytest.fixture(scope="module")
 def bench():
-    return Bench(STUDY, lambda numbers, values: numbers, (tuple(ASKEW),), (0.1, END))
+    return Bench(STUDY, join_numbers([]).place, (tuple(ASKEW),), (0.1, END))
 
 
 def gain(bench, source, output, frequency):
@@ -98,22 +112,26 @@ def test_a_drive_is_identified_from_command_and_motor(tmp_path):
         "drive.kd": {"from": 20.0, "to": 200.0},
         "drive.coulomb_friction": {"from": 0.0, "to": 0.5},
     }
-    entries = [MOTOR | {"file": "motor.csv"}, MOTOR | {"output": "slider 1", "file": "slider.csv"}]
-    one = np.ones(len(FREQUENCY))
-    for entry in entries:
-        write(tmp_path, entry["file"], frequency_hz=FREQUENCY, real=one, imag=one)
+    blank(tmp_path)
+    problem = posed(spec_of(tmp_path, MOTOR, MOTOR | {"output": "slider 1"}, free=free))
     truth = np.array([2.3e4, 70.0, 0.12])
     rng = np.random.default_rng(0)
-    for entry, one in zip(entries, made(spec_of(tmp_path, *entries, free=free))[1], strict=True):
-        exact, _ = one.predict(truth, False)
-        sigma = np.hypot(0.03 * np.abs(exact), 1e-5)
-        noisy = exact + sigma * (rng.normal(size=(2, len(exact))).T @ [1, 1j])
-        columns = {"real": noisy.real, "imag": noisy.imag}
-        write(tmp_path, entry["file"], frequency_hz=FREQUENCY, **columns)
-    found = fit(spec_of(tmp_path, *entries, free=free))
-    assert found.answer.is_explained
-    assert np.all(np.abs(found.answer.values - truth) < 4 * found.answer.sigma)
-    assert np.all(found.answer.sigma < 0.03 * truth)
+    for one in problem.measurements:
+        give_data(problem.bench, one, truth, rng)
+    answer = answered(problem)
+    assert answer.is_explained
+    assert np.all(np.abs(answer.values - truth) < 4 * answer.sigma)
+    assert np.all(answer.sigma < 0.03 * truth)
+    has_effect(problem.measurements[0], [2e4, 60.0, 0.0], 2)
+
+
+def has_effect(measurement, values, number):
+    """A number that is 0 in the study, whose programs leave it out where it is not free."""
+    none, slope = measurement.predict(np.array(values), True)
+    some, _ = measurement.predict(np.array(values) + 1e-3 * np.eye(len(values))[number], False)
+    assert np.abs(slope[:, number]).max() > 0
+    atol = 3e-5 * np.abs(slope[:, number]).max()
+    np.testing.assert_allclose(some - none, 1e-3 * slope[:, number], atol=atol)
 
 
 def test_friction_from_the_motor_s_force_of_a_move(tmp_path):
@@ -122,19 +140,20 @@ def test_friction_from_the_motor_s_force_of_a_move(tmp_path):
         "drive.coulomb_friction": {"from": 0.0, "to": 3.0},
         "drive.viscous_friction": {"from": 0.0, "to": 30.0},
     }
-    study = {"drive": {"friction_speed": 0.01}}
     time = np.arange(0.0, 0.05, 2e-4)
     entry = TRACE | {"output": "motor 1", "sigma": 0.05}
     write(tmp_path, "trace.csv", time=time, value=np.ones(len(time)))
-    truth = np.array([0.8, 9.0])
-    _, (model,), _ = made(spec_of(tmp_path, entry, free=free, study=study))
-    exact, _ = model.predict(truth, False)
-    noisy = exact + 0.05 * np.random.default_rng(0).normal(size=len(time))
-    write(tmp_path, "trace.csv", time=time, value=noisy)
-    found = fit(spec_of(tmp_path, entry, free=free, study=study))
-    assert found.answer.is_explained
-    assert np.all(np.abs(found.answer.values - truth) < 4 * found.answer.sigma)
-    assert np.all(found.answer.sigma < 0.1 * truth)
+    study = {"drive": {"friction_speed": 0.01}}
+    problem = posed(spec_of(tmp_path, entry, free=free, study=study))
+    (one,), truth = problem.measurements, np.array([0.8, 9.0])
+    exact, _ = one.predict(truth, False)
+    one.measured = exact + 0.05 * np.random.default_rng(0).normal(size=len(time))
+    answer = answered(problem)
+    assert answer.is_explained
+    assert np.all(np.abs(answer.values - truth) < 4 * answer.sigma)
+    assert np.all(answer.sigma < 0.1 * truth)
+    for number in range(2):
+        has_effect(one, [0.0, 0.0], number)
 
 
 @pytest.mark.parametrize(

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from studies.errors import StudyError
-from studies.fitting.estimate import fit
+from studies.fitting.measurements import make_bench
 from studies.fitting.records import RecordSettings, recorded_response
-from tests.fits import ASKEW, made, spec_of, write
+from tests.fits import ASKEW, RESPONSE, answered, blank, made, posed, spec_of, write
 
 RATE, LENGTH = 2000.0, 2**17
 HANN = RecordSettings(segment=4.0, has_window=True, is_h2=False, band=(60.0, 500.0))
@@ -89,12 +89,25 @@ def test_impacts_stand_alone():
     assert np.median(error / np.abs(two_modes(found.frequency))) < 2e-3
 
 
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """The folder of a record of 8 s, with columns that are none."""
+    folder = tmp_path_factory.mktemp("records")
+    time, source, output = recorded(two_modes, 0, length=2**14)
+    columns = {"input": source, "output": output, "still": 0 * time, "value": time**2}
+    write(folder, "record.csv", time=time, **columns)
+    return folder
+
+
+SHORT = RECORD | {"segment_s": 0.5}
+
+
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"segment_s": 40.0}, r"segment_s = 40.0; allowed: 0.008 to 26.2: 4 segments or more"),
+        ({"segment_s": 40.0}, r"segment_s = 40.0; allowed: 0.008 to 3.28: 4 segments or more"),
         ({"segment_s": 1e-4}, "segment_s = 0.0001; allowed"),
-        ({"to_hz": 60.1}, "allowed: 3 or more, 0.5 Hz apart"),
+        ({"to_hz": 60.1}, "allowed: 3 or more, 4 Hz apart"),
         ({"to_hz": 5000.0}, "to_hz = 5000.0; allowed: up to 1000, half the sample rate"),
         ({"from_hz": 600.0}, "from_hz = 600.0; allowed: below 500"),
         ({"value": "still"}, "the recorded output does not change"),
@@ -105,12 +118,9 @@ def test_impacts_stand_alone():
         ({"window": "flat"}, "window = 'flat'"),
     ],
 )
-def test_what_is_no_record_is_refused(change, message, tmp_path):
-    time, source, output = recorded(two_modes, 0)
-    columns = {"input": source, "output": output, "still": 0 * time, "value": time**2}
-    write(tmp_path, "record.csv", time=time, **columns)
+def test_what_is_no_record_is_refused(change, message, short):
     with pytest.raises(StudyError, match=message):
-        made(spec_of(tmp_path, RECORD | change))
+        made(spec_of(short, SHORT | change))
 
 
 def test_units_do_not_matter():
@@ -123,27 +133,25 @@ def test_units_do_not_matter():
         np.testing.assert_allclose(10 * found.sigma, known.sigma, rtol=1e-6)
 
 
-def test_a_record_of_too_many_frequencies_is_refused(monkeypatch, tmp_path):
-    time, source, output = recorded(two_modes, 0)
-    write(tmp_path, "record.csv", time=time, input=source, output=output)
-    monkeypatch.setattr("studies.fitting.entries.common.MOST_ROWS", 500)
-    with pytest.raises(StudyError, match="segment_s = 4.0; allowed: up to 2.27 for this band"):
-        made(spec_of(tmp_path, RECORD))
+def test_a_record_of_too_many_frequencies_is_refused(monkeypatch, short):
+    spec = spec_of(short, SHORT)
+    bench = make_bench(spec)
+    monkeypatch.setattr("studies.fitting.entries.common.MOST_ROWS", 50)
+    with pytest.raises(StudyError, match="segment_s = 0.5; allowed: up to 0.225 for this band"):
+        made(spec, bench)
 
 
-def test_a_machine_is_fitted_to_its_record(tmp_path, monkeypatch):
-    """A record of 65 s made with the model's response gives the numbers back."""
-    response = {k: x for k, x in RECORD.items() if k not in ("segment_s", "from_hz", "to_hz")}
-    grid = np.fft.rfftfreq(LENGTH, 1 / RATE)[1:-1]
-    one = np.ones(len(grid))
-    write(tmp_path, "grid.csv", frequency_hz=grid, real=one, imag=one)
-    exact = {"kind": "response", "file": "grid.csv", "sigma": 1.0}
-    monkeypatch.setattr("studies.fitting.entries.common.MOST_ROWS", len(grid))
-    _, (model,), truth = made(spec_of(tmp_path, response | exact))
+def test_a_machine_is_fitted_to_its_record(tmp_path):
+    """A record of 33 s made with the model's response gives the numbers back."""
+    blank(tmp_path)
+    known = RESPONSE | {"output": RECORD["output"]}
+    bench, (model,), truth = made(spec_of(tmp_path, known))
+    length = LENGTH // 2
+    model.frequency = np.fft.rfftfreq(length, 1 / RATE)[1:-1]
     curve, _ = model.predict(truth, False)
-    time, source, output = recorded(lambda f: np.r_[0, curve, 0], 3)
+    time, source, output = recorded(lambda f: np.r_[0, curve, 0], 3, length=length)
     write(tmp_path, "record.csv", time=time, input=source, output=output)
-    found = fit(spec_of(tmp_path, RECORD))
-    assert found.answer.is_explained
-    away = np.abs(found.answer.values - truth) / found.answer.sigma
-    assert np.all(away < 4) and np.all(found.answer.sigma[:2] < 0.01 * truth[:2])
+    answer = answered(posed(spec_of(tmp_path, RECORD), bench))
+    assert answer.is_explained
+    away = np.abs(answer.values - truth) / answer.sigma
+    assert np.all(away < 4) and np.all(answer.sigma[:2] < 0.01 * truth[:2])

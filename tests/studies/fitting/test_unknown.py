@@ -12,7 +12,20 @@ from studies.errors import StudyError
 from studies.fitting.estimate import fit
 from studies.fitting.run import run_fit
 from studies.show.document import schema
-from tests.fits import FREQUENCY, MAGNITUDE, RESPONSE, TIME, TRACE, blank, made, spec_of, write
+from tests.fits import (
+    FREQUENCY,
+    MAGNITUDE,
+    RESPONSE,
+    TIME,
+    TRACE,
+    Ringing,
+    answered,
+    blank,
+    made,
+    posed,
+    spec_of,
+    write,
+)
 from tests.pages import tables_of
 
 GAIN, DELAY = -0.8, 3.1e-4
@@ -20,15 +33,19 @@ UNKNOWN = {"unknown": ["gain", "delay"]}
 OWN = RESPONSE | {"output": "sensor 1.1"}
 
 
-def measure(folder, seed=0, entry=OWN):
-    """A response with a wrong gain, late, and its 3 % of noise; the true parameters."""
-    blank(folder)
-    _, (one,), truth = made(spec_of(folder, entry))
-    exact, _ = one.predict(truth, False)
+def noisy(exact, seed=0):
+    """A response with a wrong gain, late, with its 3 % of noise; and the deviations of that."""
     exact = GAIN * exact * np.exp(-2j * np.pi * FREQUENCY * DELAY)
     sigma = np.hypot(0.03 * np.abs(exact), 1e-5)
     noise = np.random.default_rng(seed).normal(size=(2, len(exact))).T @ [1, 1j]
-    measured = exact + sigma * noise
+    return exact + sigma * noise, sigma
+
+
+def measure(folder):
+    """A file of that response; the true parameters."""
+    blank(folder)
+    _, (one,), truth = made(spec_of(folder, OWN))
+    measured, _ = noisy(one.predict(truth, False)[0])
     columns = {"real": measured.real, "imag": measured.imag}
     write(folder, "response.csv", frequency_hz=FREQUENCY, **columns)
     return truth
@@ -36,7 +53,10 @@ def measure(folder, seed=0, entry=OWN):
 
 def test_they_are_found_beside_the_parameters(tmp_path):
     truth = measure(tmp_path)
-    found = run_fit(spec_of(tmp_path, OWN | UNKNOWN), tmp_path / "out", Console(quiet=True))
+    quick = {"starts": 2, "refine": 1, "profile": False}
+    quick["next"] = {"inputs": ["actuator 1.1"], "outputs": ["sensor 1.1"]}
+    spec = spec_of(tmp_path, OWN | UNKNOWN, **quick)
+    found = run_fit(spec, tmp_path / "out", Console(quiet=True))
     assert found.answer.is_explained
     assert 2 * len(FREQUENCY) - found.answer.freedom in (4, 5)  # one direction may be open
     assert np.all(np.abs(found.answer.values - truth) < 4 * found.answer.sigma)
@@ -48,19 +68,20 @@ def test_they_are_found_beside_the_parameters(tmp_path):
     page = (tmp_path / "out" / "report.html").read_text()
     (table,) = tables_of(page)["Unknown numbers of measurements"]
     assert float(table["delay [ms]"][0]) == pytest.approx(1e3 * own["delay"], rel=1e-3)
-
-
-def test_without_them_the_model_does_not_explain_the_data(tmp_path):
-    measure(tmp_path)
-    assert not fit(spec_of(tmp_path, OWN)).answer.is_explained
+    # without them the model does not explain the data
+    assert not answered(posed(spec_of(tmp_path, OWN), found.problem.bench)).is_explained
 
 
 def test_uncertainties_include_them(tmp_path):
     """Three parameters of 10 records scatter as their deviations say."""
-    away = []
+    blank(tmp_path)
+    bench, (one,), truth = made(spec_of(tmp_path, OWN))
+    exact, _ = one.predict(truth, False)
+    problem = posed(spec_of(tmp_path, OWN | UNKNOWN), bench)
+    (one,), away = problem.measurements, []
     for seed in range(10):
-        truth = measure(tmp_path, seed)
-        answer = fit(spec_of(tmp_path, OWN | UNKNOWN, starts=1, profile=False)).answer
+        one.measured, one.sigma = noisy(exact, seed)
+        answer = answered(problem)
         away.append((answer.values - truth) / answer.sigma)
     assert chi2.ppf(1e-3, 30) < np.sum(np.square(away)) < chi2.ppf(1 - 1e-3, 30)
 
@@ -72,6 +93,8 @@ def test_the_slope_of_chi_square_is_exact(entry, tmp_path):
     rng = np.random.default_rng(0)
     write(tmp_path, "trace.csv", time=TIME, value=0.1 * rng.normal(size=len(TIME)))
     _, (one,), _ = made(spec_of(tmp_path, entry))
+    if one.kind == "trace":
+        one._motion = Ringing()
     place = truth * [1.02, 0.9, 1.05]
 
     def square(x):

@@ -8,18 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from studies.engine import batched as batched_module
-from studies.engine import function, lanes, plan
+from studies.engine import executor, function, lanes
+from studies.engine.batched import batched
 from studies.engine.executor import Executor
 from studies.engine.function import STEPPERS
 from studies.errors import NoKernelError, NoKernelWarning
 from studies.kernels import cpu, graph
 from studies.kernels.equations import call_of, literal, scan_of, trace
-from tests.studies.engine import test_batched
-from tests.studies.kernels.test_kernel import check_equal, translated
-from tests.studies.kernels.test_tangents import LAYOUT, chunk, place  # noqa: F401 (a fixture)
-from tests.studies.sweeps.test_sweep_commands import toml_of
+from tests.canonical import study_of, text_of
+from tests.studies.kernels.test_kernel import RELEASED, check_equal, smallest, translated
+from tests.studies.kernels.test_tangents import LAYOUT, N_PARAMETERS, place
 from tests.studies.test_cli import run
+from tests.sweeps import narrow_blocks
 
 
 def scanned(x, c, reverse):
@@ -135,43 +135,63 @@ gain = [0.2, 0.4]
 """
 
 
-def test_a_sweep_runs_by_the_scan_and_says_so(capsys, tmp_path, monkeypatch, no_structure):
-    monkeypatch.setattr(plan, "LANES", 8)
-    monkeypatch.setattr(plan, "LARGEST_CHUNK", 16)
+def test_a_sweep_runs_by_the_scan_and_says_so(capsys, tmp_path, no_structure):
     path = tmp_path / "small.toml"
-    path.write_text(toml_of(SWEEP))
-    code, text, errors = run(capsys, "sweep", path, "--out", tmp_path / "out")
+    path.write_text(text_of(RELEASED) + SWEEP)
+    with narrow_blocks(16):
+        code, text, errors = run(capsys, "sweep", path, "--out", tmp_path / "out")
     assert code == 0 and "2/2 cases" in text and "Traceback" not in text + errors
     (line,) = [x for x in text.splitlines() if x.startswith("executor: ")]
     assert line.startswith("executor: XLA scan (JAX") and "KeyError: 'num_consts'" in line
 
 
-def test_the_results_are_those_of_the_kernel(chunk, no_structure, monkeypatch):  # noqa: F811
-    structure, cases, _ = chunk
-    executor = Executor(structure, LAYOUT)
-    found = executor.start(cases).wait()
-    assert executor.name.startswith("XLA scan (")
+def test_the_results_are_those_of_the_kernel(no_structure, monkeypatch):
+    structure, cases = smallest(LAYOUT.size)
+    runs = Executor(structure, LAYOUT)
+    found = runs.start(cases).wait()
+    assert runs.name.startswith("XLA scan (")
     monkeypatch.undo()
     wanted = Executor(structure, LAYOUT)
     check_equal(found, wanted.start(cases).wait())
-    assert wanted.name == STEPPERS["kernel"] and STEPPERS["scan"] in executor.name
+    assert wanted.name == STEPPERS["kernel"] and STEPPERS["scan"] in runs.name
 
 
-def test_gradients_without_a_kernel(chunk, no_structure):  # noqa: F811
-    structure, cases, parameters = chunk
-    # unoptimised, a scan takes its time for each sample, forward and back
-    executor = Executor(structure._replace(n_steps=20), LAYOUT, place=place)
+@pytest.mark.long  # in short: the same way to a function that is made up, below
+def test_gradients_without_a_kernel(no_structure):
+    structure, cases = smallest(LAYOUT.size, run__smooth=True)
+    runs = Executor(structure, LAYOUT, place=place)
     with pytest.warns(NoKernelWarning, match="XLA's scan runs instead"):
-        executor.differentiate(cases, parameters)
-    assert executor.name.startswith("XLA scan (") and executor.compile_time > 0
+        runs.differentiate(cases, np.full((LAYOUT.size, N_PARAMETERS), 0.9))
+    assert runs.name.startswith("XLA scan (") and runs.compile_time > 0
+
+
+def test_gradients_are_those_of_the_scan_where_kernels_fail(monkeypatch):
+    """They fail when they are compiled for derivatives, the first time that they are traced."""
+
+    def failing(free, own, is_differentiated):
+        assert is_differentiated
+        raise NoKernelError("an operation that kernels do not know")
+
+    def made(structure, build, free, own, shared, kind):
+        scan = SimpleNamespace(linearise=lambda free, own: ({"free": free}, None))
+        return scan if kind == "scan" else SimpleNamespace(compile=failing)
+
+    monkeypatch.setattr(executor, "block_function", made)
+    structure, cases = smallest(LAYOUT.size)
+    runs, free = Executor(structure, LAYOUT, place=place), np.full((LAYOUT.size, 4), 0.9)
+    with pytest.warns(NoKernelWarning, match="XLA's scan runs instead"):
+        found = runs.differentiate(cases, free)
+    np.testing.assert_array_equal(found.result["free"], free)
+    assert runs.name == "XLA scan (an operation that kernels do not know)"
+    assert runs.compile_time > 0
 
 
 def test_batched_without_a_kernel(no_structure):
-    parameters = np.array([[0.5, 0.05, 0.0], [1.0, 0.05, 0.0]])
-    run_batch = batched_module.batched(test_batched.STUDY, test_batched.NAMES)
+    """Made, if not run: as the scan that the results above are of."""
+    run_batch = batched(study_of(RELEASED), ("control.gain_factor",))
     with pytest.warns(NoKernelWarning, match="XLA's scan runs instead"):
-        found = jax.jit(run_batch)(parameters)
-    assert (np.asarray(found.status) == 0).all()
+        found = jax.eval_shape(run_batch, np.array([[0.1], [0.5]]))
+    assert found.status.shape == (2,)
 
 
 def halved(constants, row, state):

@@ -25,7 +25,7 @@ from studies.kernels.differentiable import DifferentiableLoop
 from studies.kernels.traced import InputLeaf, trace_loop
 from studies.study.cases import build_cases, build_structure
 from studies.study.spec import paper_study
-from tests.studies.kernels.test_kernel import check_equal, every_operation
+from tests.studies.kernels.test_kernel import check_equal, every_operation, smallest
 
 LAYOUT = Layout(devices=1, blocks=2, lanes=gpu.BLOCK)
 
@@ -103,7 +103,7 @@ def test_gradients_equal_those_of_the_traced_kernel(monkeypatch):
     def value(kind, leaves):
         given = step, constants, inputs, [InputLeaf(shape, True)], np.float64, n, lanes, kind
         loop = DifferentiableLoop(*given)
-        return jax.value_and_grad(lambda x: (loop(x)[0] ** 2).sum())(leaves)
+        return jax.jit(jax.value_and_grad(lambda x: (loop(x)[0] ** 2).sum()))(leaves)
 
     leaves = [
         random.normal(size=(3, lanes)),
@@ -119,7 +119,7 @@ def test_gradients_equal_those_of_the_traced_kernel(monkeypatch):
 def test_without_the_call_target_the_scan_runs(monkeypatch):
     """Here XLA knows no call of PTX."""
     monkeypatch.setattr(function, "_FUNCTIONS", {})
-    structure, cases = work("W1")
+    structure, cases = smallest(LAYOUT.size)
     executor = Executor(structure, LAYOUT, kind="gpu")
     assert executor.start(cases).wait().status[0] == status.OK
     assert "(the GPU kernel failed: " in executor.name
@@ -134,7 +134,7 @@ def test_what_sweeps_run_with_is_said(monkeypatch):
 
 
 def test_it_is_chosen_on_a_graphics_processor(monkeypatch):
-    structure, _ = work("W1")
+    structure, _ = smallest(1)
     monkeypatch.setattr(function, "processor", lambda: "cuda")
     assert stepper(structure) == "gpu"
     assert stepper(structure._replace(substeps=100)) == "scan"

@@ -1,6 +1,7 @@
 """The traced kernel against the scan: the same step, the same results."""
 
 import hashlib
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from jaxmodel import status
 from jaxmodel.trigonometry import sine_cosine
 from studies.bench.works import METRICS, WORKS
 from studies.engine.executor import CaseLeaves, Executor, executor_text
-from studies.engine.function import STEPPERS, TRACES, block_function
+from studies.engine.function import STEPPERS, block_function
 from studies.engine.plan import Layout, chunk_cases, local_layout, plan_groups
 from studies.engine.programs import environment
 from studies.errors import NoKernelError
@@ -21,6 +22,7 @@ from studies.kernels.traced import InputLeaf, trace_loop
 from studies.space.table import build_table
 from studies.study.cases import build_cases, build_structure
 from studies.study.spec import paper_study
+from tests.canonical import HOME, study_of
 from tests.sweeps import MIXED, small_spec
 
 LAYOUT = Layout(devices=2, blocks=1, lanes=16)
@@ -88,12 +90,9 @@ STIFFNESSES = {"method": "random", "count": 32, "axes": {"drive.kp": {"from": 1e
     ("sweep", "sections"),
     [
         (ALL_SORTS, {"metrics": {"residual_delay": 0.0, "residual_length": 0.004}}),
-        (STIFFNESSES, HEAVY),
-        pytest.param(
-            STIFFNESSES,
-            OTHER_SORTS,
-            marks=pytest.mark.long,
-        ),
+        # in short: every operation is translated, below
+        pytest.param(STIFFNESSES, HEAVY, marks=pytest.mark.long),
+        pytest.param(STIFFNESSES, OTHER_SORTS, marks=pytest.mark.long),
     ],
     ids=[
         "mixed sampled cases",
@@ -129,17 +128,36 @@ def test_odd_numbers_of_cases_fill_whole_vectors():
         kernel.run([np.zeros(1, np.float32), np.zeros(3, np.float32)], 1, 3)
 
 
+#: Few samples of a released link, for what any machine shows.
+RELEASED = {
+    "title": "released",
+    "run": {"duration": 0.002},
+    "link": {"modes": 1},
+    "control": {"modes": 1, "feedback": "ideal"},
+    "initial": {"modal": [[1e-6]] * 3},
+    "motion": {"waypoints": [HOME]},
+    "shaper": {"kind": "none"},
+    "metrics": {"residual_delay": 0.0, "residual_length": 0.001},
+}
+
+
+def smallest(size, **fields):
+    """Structure and cases of `RELEASED`."""
+    study = study_of(RELEASED, **fields)
+    structure = build_structure(study)._replace(metrics=("residual_rms",))
+    gains = np.linspace(0.1, 0.5, size)
+    return structure, build_cases(study, {"control.gain_factor": gains}, structure)
+
+
 def test_without_llvmlite_the_scan_runs(monkeypatch):
-    table = build_table(small_spec(MIXED))
-    group = plan_groups(table, np.arange(8), local_layout)[0]
-    assert Executor(group.structure, LAYOUT).name == STEPPERS["kernel"]
+    structure, cases = smallest(LAYOUT.size)
+    assert Executor(structure, LAYOUT).name == STEPPERS["kernel"]
     for module in (llvm, native):
         monkeypatch.setattr(module, "binding", None)
     native.this_processor.cache_clear()
-    executor = Executor(group.structure, LAYOUT)
+    executor = Executor(structure, LAYOUT)
     assert executor.name == STEPPERS["scan"]
-    result = executor.start(chunk_cases(table, group.rows, group.structure, LAYOUT.size)).wait()
-    assert np.all(np.isin(result.status, status.FINISHED))
+    assert np.all(np.isin(executor.start(cases).wait().status, status.FINISHED))
     assert "needs llvmlite" in executor_text() and len(environment()) > 8
     native.this_processor.cache_clear()
 
@@ -161,8 +179,13 @@ def translated(function, shape, dtype=np.float64, lanes=16):
     )
     out = x.copy()
     cpu.build_kernel(loop).run([np.zeros((1, 1), dtype), out], 1, lanes)
-    wanted = np.asarray(jax.vmap(function, (-1, None), -1)(x, c))
-    return out, wanted
+    return out, np.asarray(reference(function)(x, c))
+
+
+@cache
+def reference(function):
+    """Of whole vectors, by JAX."""
+    return jax.jit(jax.vmap(function, (-1, None), -1))
 
 
 def every_operation(x, c, bend=jnp.tanh):
@@ -322,7 +345,7 @@ def leave_nothing_but_nan_on_the_stack(lanes):
 
 @pytest.mark.parametrize("directions", [0, 2])
 def test_routines_are_what_they_replace(processor, directions):
-    rng, shape, lanes = np.random.default_rng(2), (3, 4), 16
+    rng, shape, lanes = np.random.default_rng(2), (2, 2), 16
     given = [rng.normal(size=shape), rng.normal(size=lanes)]
     arguments = (
         [given[0], InputLeaf((), True)],
@@ -372,23 +395,17 @@ def test_code_for_arm():
 # --- guards against slow code, which tests cannot time --------------------------------------------
 
 
+@cache
 def workload(work):
-    """Structure and cases of a workload."""
-    study = paper_study().change(**WORKS[work], run__duration=0.3)
+    """The function of a block of a workload."""
+    study = paper_study().change(**WORKS[work])
     structure = build_structure(study)._replace(metrics=METRICS.get(work, ()))
     gains = np.linspace(0.1, 0.5, LAYOUT.size)
-    return structure, build_cases(study, {"control.gain_factor": gains}, structure)
-
-
-def operations_of(work):
-    """Operations of one sample of a workload, by kind."""
-    structure, cases = workload(work)
-    made = Executor(structure, LAYOUT, kind="kernel")
-    before = len(TRACES)
-    made.start(cases).wait()
-    made.start(cases).wait()
-    assert len(TRACES) == before + 1  # compiled once for both chunks
-    return made.operations
+    leaves, tree = jax.tree.flatten(build_cases(study, {"control.gain_factor": gains}, structure))
+    is_own = tuple(len(leaf) > 1 for leaf in leaves)
+    own = [x[: LAYOUT.lanes] for x, yes in zip(leaves, is_own, strict=True) if yes]
+    shared = [x[0] for x, yes in zip(leaves, is_own, strict=True) if not yes]
+    return block_function(structure, CaseLeaves(tree, is_own), (), own, shared, "kernel")
 
 
 #: Operations, with some room, as docs/performance.md has them.
@@ -397,7 +414,7 @@ MOST = {"W0": 3630, "W1": 4680}
 
 @pytest.mark.parametrize("work", ["W0", pytest.param("W1", marks=pytest.mark.long)])
 def test_a_sample_takes_no_more_operations_than_it_should(work):
-    found = operations_of(work)
+    found = workload(work).operations
     assert found.pop("read") < 700
     calls = found.pop("call", 0), found.pop("result", 0)
     # routines work out for every call what only some of them want
@@ -424,13 +441,8 @@ def test_code_of_a_sample_is_as_small_as_it_should_be(work, kind):
     if not triple.startswith("x86_64"):
         pytest.skip("needs an x86 processor")
     processor = native.Processor(*kind, triple)
-    structure, cases = workload(work)
-    leaves, tree = jax.tree.flatten(cases)
-    is_own = tuple(len(leaf) > 1 for leaf in leaves)
-    own = [x[: LAYOUT.lanes] for x, yes in zip(leaves, is_own, strict=True) if yes]
-    shared = [x[0] for x, yes in zip(leaves, is_own, strict=True) if not yes]
-    block = block_function(structure, CaseLeaves(tree, is_own), (), own, shared)
-    loop = trace_loop(*block.loop_arguments(), np.float64, 0, not processor.has_masks)
+    arguments = workload(work).loop_arguments()
+    loop = trace_loop(*arguments, np.float64, 0, not processor.has_masks)
     code = native.machine_code(str(cpu.write_loop(loop, processor).module), processor, 3)
     sections = native.binding.ObjectFileRef.from_data(code).sections()
     size = sum(section.size() for section in sections if section.is_text())

@@ -76,8 +76,9 @@ def test_every_operation_is_differentiated():
     out, pushed = x.copy(), along.copy()
     built.run([np.zeros((1, 1)), out, pushed], 1, lanes)
     whole = jax.vmap(every_operation, (-1, None), -1)
+    pushed_by_jax = jax.jit(lambda x, t: jax.jvp(lambda x: whole(x, c), (x,), (t,)))
     for k in range(directions):
-        value, wanted = jax.jvp(lambda x: whole(x, c), (x,), (along[k],))
+        value, wanted = pushed_by_jax(x, along[k])
         np.testing.assert_allclose(out, value, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(pushed[k], wanted, rtol=1e-11, atol=1e-11)
     assert np.abs(translated(every_operation, shape)[0]).max() > 1
@@ -157,11 +158,15 @@ def test_reverse_of_a_loop_gives_the_gradient(has_masks):
             x = step([gain, fixed], [row], x)
         return x
 
-    wanted, back = jax.vjp(jax.vmap(ended, -1, -1), gain, given, start)
+    @jax.jit
+    def pulled(turned, *arguments):
+        found, back = jax.vjp(jax.vmap(ended, -1, -1), *arguments)
+        return found, back(turned)
+
+    turned = [random.normal(size=x.shape) for x in start]
+    wanted, (by_gain, by_given, by_start) = pulled(turned, gain, given, start)
     for a, b in zip(last, wanted, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
-    turned = [random.normal(size=x.shape) for x in start]
-    by_gain, by_given, by_start = back([jnp.asarray(x) for x in turned])
     sums, rows = np.zeros_like(gain), np.empty_like(given)
     run = build_kernel(made.backward, processor).run
     run([gain, given, kept, *turned, sums, rows], n, lanes)

@@ -3,6 +3,8 @@
 import json
 import re
 from functools import partial
+from types import SimpleNamespace
+from unittest.mock import patch
 
 import jsonschema
 import numpy as np
@@ -14,6 +16,7 @@ from jaxmodel.piezo import actuator_constant, sensor_constant
 from studies.papers.card import FAILS, HOLDS, depends_on, outcome_of
 from studies.papers.catalogue import CARDS
 from studies.papers.geronel_2025 import card as geronel_card
+from studies.papers.geronel_2025 import comparison as geronel_comparison
 from studies.papers.geronel_2025.comparison import (
     SensorComparison,
     matched_gain,
@@ -31,6 +34,7 @@ from studies.papers.gupta_2010.criteria import (
 )
 from studies.papers.gupta_2010.findings import PlaceGrid, rank
 from studies.papers.rrr_2016 import card as rrr_card
+from studies.papers.rrr_2016 import confirmation, energies, findings, thresholds
 from studies.papers.rrr_2016.claims import judge
 from studies.papers.rrr_2016.confirmation import confirm
 from studies.papers.rrr_2016.coupling import (
@@ -42,21 +46,24 @@ from studies.papers.rrr_2016.coupling import (
 )
 from studies.papers.rrr_2016.energies import (
     ALL,
+    ALONE,
     LINKS,
     NONE,
     PLUCKED,
     SETTLED,
     Energies,
+    _plucks,
     free_energies,
     propagator,
 )
 from studies.papers.rrr_2016.findings import Baseline, Effort, Kind, Sampled
-from studies.papers.rrr_2016.machines import baselines, sample, varied
+from studies.papers.rrr_2016.machines import baselines, one_study, sample, varied
 from studies.papers.rrr_2016.thresholds import DAMPING, greatest_damping, threshold
 from studies.papers.run import run_card
 from studies.show.document import schema
 from studies.study.cases import build_case
 from studies.study.spec import paper_study
+from tests.canonical import MACHINE, study_of
 from tests.pages import text_of
 from tests.studies.test_cli import refused, run
 
@@ -99,20 +106,63 @@ def test_outcomes():
 SMALL = Effort(
     machines=256,
     poses=3,
-    modes=(1, 2),
-    drives=3,
-    masses=3,
+    modes=(1,),
+    drives=2,
+    masses=2,
     strengths=(0.05,),
     simulated=(),
 )
+RRR = baselines()["3-RRR"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_batches():
+    """One size of batches for all; not by monkeypatch, since programs with it may be kept."""
+    with patch.object(energies, "_BATCH", 32):
+        yield
+
+
+def card_on_few_machines(folder, effort):
+    with patch.object(thresholds, "HALVINGS", 2):
+        small = rrr_card.CARD._replace(run=partial(rrr_card.evaluate, effort))
+        return run_card(small, folder, Console(quiet=True))
 
 
 @pytest.fixture(scope="module")
 def coupled(tmp_path_factory):
-    """Folder and result of the card on few machines."""
+    """Folder and result of the card on few machines of one of its kinds."""
     folder = tmp_path_factory.mktemp("rrr")
-    small = rrr_card.CARD._replace(run=partial(rrr_card.evaluate, SMALL))
-    return folder, run_card(small, folder, Console(quiet=True))
+    with patch.object(findings, "baselines", lambda: {"3-RRR": RRR}):
+        return folder, card_on_few_machines(folder, SMALL)
+
+
+@pytest.mark.long  # in short: one of the kinds, with one mode
+def test_one_mode_per_link_is_enough(tmp_path):
+    result = card_on_few_machines(tmp_path, SMALL._replace(modes=(1, 2)))
+    assert {row[0] for row in result.tables["modes"].rows} == set(baselines())
+    rows = np.array([row[1:] for row in result.tables["modes"].rows], float)
+    np.testing.assert_allclose(rows[::2, 1:], rows[1::2, 1:], rtol=0.01)
+    assert "depends on the coupling ratio" in result.verdicts[1].outcome
+
+
+def test_the_first_mode_of_each_link_is_plucked():
+    """Of two: q stands behind place and velocity of the platform."""
+    found = _plucks(SimpleNamespace(n_pose=3, n_links=3, n_modes=2))
+    np.testing.assert_array_equal(found, np.eye(18)[:, [6, 8, 10]])
+
+
+@pytest.mark.parametrize("name", baselines())
+def test_studies_of_a_sample_have_its_numbers(name):
+    """Mass at the near joints: of a slider, or of a crank 0.15 m long."""
+    machines = sample(baselines()[name], 4, seed=1)
+    study, columns = one_study(machines, 2), machines.columns
+    at = {"3-PRR": "machine.slider_mass", "3-RRR": "machine.kinds.rrr.crank_inertia"}[name]
+    near = columns[at][2] / {"3-PRR": 1.0, "3-RRR": 0.15**2}[name]
+    omega = np.sqrt(columns["drive.kp"][2] / near)
+    assert columns["drive.kd"][2] == pytest.approx(near * omega)  # half damped
+    assert 0.02 <= near <= 0.5 and 71.9 <= omega <= 7190.0
+    assert study.motion.waypoints == (tuple(machines.poses[2]),)
+    assert study.machine.platform_mass == columns["machine.platform_mass"][2]
 
 
 def test_card_writes_a_whole_folder(coupled):
@@ -128,10 +178,11 @@ def test_card_writes_a_whole_folder(coupled):
     assert all(x["found"] in text for x in found["claims"])
 
 
-def test_a_whole_simulation_confirms_the_linear_plant():
-    """Sampled, nonlinear, with converters: its delay costs link 1 some damping."""
-    machines = varied(
-        baselines()["3-RRR"],
+@pytest.fixture(scope="module")
+def unlike():
+    """A machine with slightly different links, out of home."""
+    return varied(
+        RRR,
         link_mass=np.array([20.0]),
         platform_mass=np.array([0.2]),
         near_mass=np.array([0.1]),
@@ -141,7 +192,12 @@ def test_a_whole_simulation_confirms_the_linear_plant():
         stiffness=np.array([[1.0, 1.01, 0.99]]),
         poses=np.array([[0.01, 0.02, 0.1]]),
     )
-    found = confirm(machines, 0, lambda *_: None)
+
+
+@pytest.mark.long  # in short: the linear plant runs in its place, below
+def test_a_whole_simulation_confirms_the_linear_plant(unlike):
+    """Sampled, nonlinear, with converters: its delay costs link 1 some damping."""
+    found = confirm(unlike, 0, lambda *_: None)
     assert found.linear_ratio > 0.3
     assert found.simulated_ratio == pytest.approx(found.linear_ratio, rel=0.01)
     np.testing.assert_allclose(found.simulated[1:], found.linear[1:], atol=0.01)
@@ -149,15 +205,37 @@ def test_a_whole_simulation_confirms_the_linear_plant():
     assert 0.8 * found.linear[0] < found.simulated[0] < found.linear[0]
 
 
-def test_one_mode_per_link_is_enough(coupled):
-    rows = np.array([row[1:] for row in coupled[1].tables["modes"].rows], float)
-    np.testing.assert_allclose(rows[::2, 1:], rows[1::2, 1:], rtol=0.01)
+def test_plucked_runs_confirm_the_energies(unlike):
+    """Sums over samples of the linear plant, by SciPy's exponential, of the runs asked for."""
+    plant = free_energies(unlike.study, unlike.columns, unlike.poses, 1)
+
+    def run(structure, cases, _):
+        records = []
+        for case in cases:
+            assert list(case.control.link_mask[1:]) == [0, 0]
+            mask = ALONE.start if case.control.link_mask[0] else NONE
+            step = scipy.linalg.expm(1e-4 * plant.state[0, mask])
+            states = [np.concatenate([np.zeros(6), case.initial.modal[:, 0], np.zeros(3)])]
+            for _ in range(structure.n_steps):
+                states.append(step @ states[-1])
+            states[0] *= 0.5**0.5  # half of its energy, by the trapezoidal rule
+            records.append(np.array(states)[:, 6:9, None])
+        return SimpleNamespace(record=SimpleNamespace(chord_deflection_stations=np.array(records)))
+
+    with (
+        patch.object(confirmation, "run_batches", run),
+        patch.multiple(confirmation, MODES=1, FOLLOWED=1.0),
+    ):
+        found = confirm(unlike, 0, lambda *_: None)
+    assert found.linear_ratio > 0.3 and found.linear[1:].max() > 0.05
+    assert found.simulated_ratio == pytest.approx(found.linear_ratio, rel=1e-3)
+    np.testing.assert_allclose(found.simulated, found.linear, atol=1e-3)
 
 
-@pytest.fixture(scope="module", params=["3-PRR", "3-RRR"])
-def free(request):
+@pytest.fixture(scope="module")
+def free():
     """A few machines of a sample, and their energies."""
-    machines = sample(baselines()[request.param], 32, seed=1)
+    machines = sample(RRR, 32, seed=1)
     return machines, free_energies(machines.study, machines.columns, machines.poses, 1)
 
 
@@ -198,11 +276,10 @@ def scale_of(energies):
 
 def test_links_on_locked_drives_are_on_their_own():
     """However light the platform: joints that stand still pass nothing on."""
-    study = baselines()["3-RRR"]
     ratios = []
     for drive_ratio in (1.5, 300.0):
         machines = varied(
-            study,
+            RRR,
             link_mass=np.array([10.0]),
             platform_mass=np.array([0.05]),
             near_mass=np.array([0.1]),
@@ -363,7 +440,7 @@ def test_loss_and_rank_of_a_criterion():
 
 def test_placement_card_writes_a_whole_folder(tmp_path):
     small = gupta_card.CARD._replace(
-        run=partial(gupta_card.evaluate, PlaceGrid(places=5, factors=4))
+        run=partial(gupta_card.evaluate, PlaceGrid(places=4, factors=4))
     )
     result = run_card(small, tmp_path, Console(quiet=True))
     images = [*(f"{name}.png" for name in result.figures), "machine.png"]
@@ -393,16 +470,68 @@ def test_noise_limit_of_a_known_course():
     assert np.isnan(noise_limit(noise, 2 * np.ones(3), 1.1))
 
 
-def test_sensor_card_writes_a_whole_folder_and_tells_what_decides(tmp_path):
-    small = geronel_card.CARD._replace(run=partial(geronel_card.evaluate, (1e-8, 1e-6, 3e-5), (0,)))
-    result = run_card(small, tmp_path, Console(quiet=True))
+SENSORS = (1e-8, 1e-6, 3e-5)
+
+
+@pytest.mark.long  # in short: the whole folder of runs that are made up, below
+def test_sensor_card_tells_what_decides():
+    result = geronel_card.evaluate(SENSORS, (0,), lambda *_: None)
+    assert result.verdicts[0].outcome == HOLDS
+    assert "gauges' amplifiers" in result.verdicts[1].outcome
+    limits = [float(row[4]) for row in result.tables["limits"].rows]
+    assert limits == sorted(limits, reverse=True)
+
+
+def left(modulus, noise=0.0, seed=0, is_free=False):
+    """Residual vibration that softer links with less noise leave [m]."""
+    ends = 1e-6 / modulus  # noise that adds as much as there is
+    return 1e-6 / modulus * (1 if is_free else 0.1 * np.hypot(1 + 0.01 * seed, noise / ends))
+
+
+def test_sensor_card_writes_a_whole_folder(tmp_path):
+    """Of runs that are made up: each has the number of its links, its noise and its seed."""
+    base = study_of(MACHINE, metrics__residual_length=0.01)
+    gain = matched_gain(base)
+
+    def run(_, cases, on_progress):
+        rms = []
+        for case in cases:
+            machine = case.machine
+            modulus = np.max(machine.beam.youngs_modulus) / base.link.youngs_modulus
+            is_free = not np.any(case.control.link_mask)
+            assert machine.patches.is_gauge or not machine.patches.gauge_noise
+            noise = machine.patches.gauge_noise / gain
+            rms.append(np.full((3, 1), left(modulus, noise, case.seed, is_free)))
+        metrics = SimpleNamespace(residual_rms=np.array(rms))
+        return SimpleNamespace(status=np.zeros(len(cases)), metrics=metrics)
+
+    small = geronel_card.CARD._replace(run=partial(geronel_card.evaluate, SENSORS, (0, 1)))
+    with (
+        patch.object(geronel_comparison, "paper_study", lambda: base),
+        patch.object(geronel_comparison, "run_batches", run),
+    ):
+        result = run_card(small, tmp_path, Console(quiet=True))
     images = [*(f"{name}.png" for name in result.figures), "machine.png"]
     data = [*(f"{name}.csv" for name in result.tables), "claims.json"]
     assert sorted(x.name for x in tmp_path.iterdir()) == sorted([*data, *images, "report.html"])
     assert result.verdicts[0].outcome == HOLDS
     assert "gauges' amplifiers" in result.verdicts[1].outcome
+    moduli = (0.5, 1.0, 2.0)
+    assert [row[1:] for row in result.tables["runs"].rows] == [
+        [f"{noise:.6g}", str(seed + 1), f"{left(modulus, noise, seed):.6g}"]
+        for modulus in moduli
+        for noise in SENSORS
+        for seed in (0, 1)
+    ]
+    for row, modulus in zip(result.tables["limits"].rows, moduli, strict=True):
+        assert float(row[1]) == pytest.approx(1e6 * left(modulus, is_free=True), rel=0.01)
+        both = np.mean([left(modulus, seed=seed) for seed in (0, 1)])
+        assert float(row[2]) == pytest.approx(1e6 * both, rel=0.01)
+        assert float(row[3]) == pytest.approx(1e6 * both, rel=0.01)
+    hz = [float(row[0]) for row in result.tables["limits"].rows]
+    np.testing.assert_allclose(hz, np.array([0.5, 1, 2]) ** 0.5 * hz[1], rtol=1e-3)
     limits = [float(row[4]) for row in result.tables["limits"].rows]
-    assert limits == sorted(limits, reverse=True)
+    assert limits == sorted(limits, reverse=True) and len({*limits}) == 3
 
 
 def test_equally_well_without_exceptions_holds_or_fails():

@@ -5,11 +5,11 @@ import pytest
 
 from jaxmodel import status
 from jaxmodel.sampled_loop import closed_loop
-from jaxmodel.simulate import simulate
 from studies.engine.columns import LEFT_OUT
 from studies.engine.executor import Executor
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.results import metric_values, read_sweep
+from studies.engine.runs import _simulate
 from studies.engine.sweep import make_plan, run_sweep
 from studies.errors import StudyError
 from studies.space.spec import parse_sweep
@@ -22,11 +22,16 @@ from studies.sweeps.show import ranked_cases, recommended
 from tests.pages import text_of
 from tests.studies.engine.test_sweeps import partly_done
 from tests.studies.kernels.test_kernel import ALL_SORTS, check_equal
-from tests.sweeps import HOME_PHI, small, small_spec
+from tests.sweeps import HOME_PHI, narrow_blocks, small, small_spec
 
 jax = pytest.importorskip("jax")
 HOME = (0.0, 0.0, HOME_PHI)
-_simulate = jax.jit(simulate, static_argnums=(0, 2))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def narrow():
+    with narrow_blocks():
+        yield
 
 
 def residual(study, is_linear):
@@ -275,13 +280,10 @@ def test_equal_values_have_equal_ranks():
     assert np.isnan(_rank_correlation(np.zeros(5), np.zeros(5)))
 
 
-def test_an_interrupted_screen_goes_on_where_it_was(tmp_path, folders, monkeypatch):
-    from studies.engine import plan
-
-    monkeypatch.setattr(plan, "LANES", 8)
-    monkeypatch.setattr(plan, "LARGEST_CHUNK", 16)
+def test_an_interrupted_screen_goes_on_where_it_was(tmp_path, folders):
     spec, out = screened(), tmp_path / "s"
-    stopped = partly_done(out, spec)
+    with narrow_blocks(16):  # several chunks
+        stopped = partly_done(out, spec)
     assert stopped.is_interrupted and stopped.n_run == 0
     assert (read(out)["status"] < 0).all()
     done = run(spec, out, is_resumed=True)

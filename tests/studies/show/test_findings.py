@@ -486,9 +486,8 @@ def test_placements_are_shown_in_millimetres_along_each_link():
         {**SMALL, "tune": {"free": {"placement": {"kind": "per_link"}}, "starts": 1}}
     )
     _, found, *_ = tuned()
-    at, n = begin(spec, SimpleNamespace(linear=None)), len(spec.free.names)
-    place = np.full((1, n), 0.5)
-    at = at._replace(
+    place = np.full((1, len(spec.free.names)), 0.5)
+    at = found.at._replace(
         best_objective=np.ones(1),
         best_limits=np.zeros((1, 0)),
         best_place=place,

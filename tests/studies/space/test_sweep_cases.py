@@ -17,6 +17,7 @@ from studies.space.table import build_table, case_study
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure, case_of
 from studies.study.fields import Fields, padded
 from studies.study.numbers import study_numbers
+from tests.canonical import MACHINE
 from tests.sweeps import BASE, MIXED, small, small_spec
 
 
@@ -146,11 +147,15 @@ def test_id_and_seed_belong_to_the_case_not_to_the_sweep():
 
 @pytest.mark.parametrize(
     ("sweep", "count"),
-    [({}, 1), ({"repeats": 3}, 3), ({"axes": {"run.duration": [0.025, 0.03]}}, 2)],
+    [
+        ({"repeats": 3}, 3),
+        pytest.param({}, 1, marks=pytest.mark.long),
+        pytest.param({"axes": {"run.duration": [0.025, 0.03]}}, 2, marks=pytest.mark.long),
+    ],
 )
 def test_cases_that_differ_in_no_number_run(sweep, count, tmp_path):
     """They share every array, seeds included, as long as there is no noise."""
-    done = run_sweep(small_spec(sweep), tmp_path / "sweep", is_quiet=True)
+    done = run_sweep(parse_sweep(MACHINE | {"sweep": sweep}), tmp_path / "sweep", is_quiet=True)
     assert done.n_run == count
     rms = read_sweep(tmp_path / "sweep")["structural_rms"]
     assert len(rms) == count and np.isfinite(rms).all()

@@ -2,6 +2,7 @@
 
 import json
 from types import SimpleNamespace
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,6 @@ from jaxmodel.controller import with_gains
 from jaxmodel.discs import Disc, excludes_zero, interval, inverse_of
 from jaxmodel.modal_loop import law_poles, law_response
 from jaxmodel.mode_tail import bound_tail, static_rest
-from jaxmodel.sampled_loop import delayed_loop
 from jaxmodel.zero_exclusion import NEAR, prepare_exclusion, return_difference
 from studies.engine.controller import fixed_controller
 from studies.engine.stability import gain_margin
@@ -38,6 +38,7 @@ from studies.spillover.proofs import (
     Proofs,
     ProvenBox,
     SpectralRadius,
+    _delayed_loop,
     collect,
     proof_texts,
     prove_all_modes,
@@ -45,9 +46,17 @@ from studies.spillover.proofs import (
     volume,
 )
 from studies.spillover.report import document, report, verdict
+from studies.threads import serial_blas
 from tests.pages import text_of
 from tests.proofs import ONE_MOVE as STUDY
 from tests.proofs import many_modes_loop, random_design, spectral_radius
+
+
+@pytest.fixture(scope="module", autouse=True)
+def serial():
+    """Threads of BLAS only wait for each other: its matrices are small."""
+    with serial_blas():
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -136,20 +145,19 @@ def test_resonances_of_a_link_that_differs_are_its_own(changed):
 # --- the return difference ------------------------------------------------------------------------
 
 
-def test_the_return_difference_is_that_of_the_eigenvalue_problem(design, law, loop, monkeypatch):
+@mock.patch.object(zero_exclusion, "NEAR", 12)  # part of no program
+def test_the_return_difference_is_that_of_the_eigenvalue_problem(design, law, loop):
     """det F with and without gains, against det(z - A) of the exact discretisation.
 
     Nearly all images evaluated; what is left out of the sum then falls as their number cubed.
     """
-    monkeypatch.setattr(zero_exclusion, "NEAR", 12)
     setup = prepare_exclusion(loop, LARGEST, BOX[0], BOX[2], has_tail=False)
     structure = plant_structure(design, SINES, LARGEST)
     case = design.case._replace(
         initial=design.case.initial._replace(modal=np.zeros((3, LARGEST))),
         n_modes=jnp.asarray(LARGEST),
     )
-    pose = np.array(STUDY.motion.waypoints[0])
-    matrix = jax.jit(delayed_loop, static_argnums=0)
+    pose, law = np.array(STUDY.motion.waypoints[0]), jax.tree.map(np.asarray, law)
     period, rng = float(loop.period), np.random.default_rng(1)
     for _ in range(3):
         stiffness, delay, payload = (rng.uniform(*ends) for ends in BOX)
@@ -161,7 +169,9 @@ def test_the_return_difference_is_that_of_the_eigenvalue_problem(design, law, lo
             )
         )
         with_it, without = (
-            np.asarray(matrix(structure, changed, pose, with_gains(law, factor), delay))
+            np.asarray(
+                _delayed_loop(structure, changed, pose, with_gains(law, factor), np.array(delay))
+            )
             for factor in (1.0, 0.0)
         )
         for hertz in (8.0, 113.0, 460.0, 1200.0, 2860.0, 4700.0):
@@ -346,7 +356,7 @@ def judged(design, n_modes):
 
 
 def test_what_is_proven_is_stable_with_many_modes(design):
-    share, radius = judged(design, 60)
+    share, radius = judged(design, 40)
     assert radius < 1 and share > 0.9
 
 
@@ -485,7 +495,7 @@ def test_a_verdict_names_plant_and_machine_where_both_fail(near):
     assert said.endswith("stiffness x 1, 0.5 samples of extra delay, 0.05 kg more payload")
 
 
-def test_an_unstable_machine_of_one_mode_is_not_hidden_by_others(monkeypatch):
+def test_an_unstable_machine_of_one_mode_is_not_hidden_by_others():
     """Of a law that is judged mode by mode, one of which has no proof."""
     boxes = [
         PROVEN.box._replace(undecided=1.0, fault="no bound"),
@@ -493,7 +503,10 @@ def test_an_unstable_machine_of_one_mode_is_not_hidden_by_others(monkeypatch):
         PROVEN.box,
     ]
     waiting = iter(boxes)
-    monkeypatch.setattr(proofs_module, "prove_box", lambda *_: next(waiting))
-    monkeypatch.setattr(proofs_module, "prove_all_modes", lambda *_: PROVEN.all_modes)
     switching = fixed_controller(STUDY.change(control__law="modified_imsc"))
-    assert proofs_module.prove(switching).box == boxes[1]
+    with mock.patch.multiple(
+        proofs_module,
+        prove_box=lambda *_: next(waiting),
+        prove_all_modes=lambda *_: PROVEN.all_modes,
+    ):
+        assert proofs_module.prove(switching).box == boxes[1]

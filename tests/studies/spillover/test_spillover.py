@@ -3,6 +3,7 @@
 import json
 import re
 from functools import partial
+from unittest import mock
 
 import jax
 import jsonschema
@@ -38,11 +39,12 @@ from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import paper_study
 from studies.study.template import study_template
 from studies.study.window import residual_delay
+from tests.canonical import MACHINE, study_of
 from tests.pages import parsed, text_of
 from tests.studies.test_cli import refused, run
 
-#: One move of a small plant: what the run needs; certificates have plants of their own.
-STUDY = paper_study().change(link__modes=3, motion__waypoints=paper_study().motion.waypoints[:2])
+#: What runs need; certificates have plants of their own.
+STUDY = study_of(MACHINE)
 #: The paper's gains with a plain difference for the velocity, on truncated plants: known to be
 #: unstable.
 DIFFERENCE = {
@@ -218,10 +220,11 @@ def test_plants_that_buckle_by_themselves_are_left_out():
 
 
 def test_damping_stands_beside_that_without_control():
-    ratios = ((0.005, 0.02), (0.01, 0.03), (0.02, 0.01))
-    found = certified({"link__damping_ratio": ratios}, sizes=(3,), **SAME)
+    ratios = ((0.005,), (0.01,), (0.02,))
+    changes = {"link__damping_ratio": ratios, "link__damping_law": "stiffness"}
+    found = certified(changes, sizes=(3,), **SAME)
     free = found.free_damping[0, 0, 0, :2]
-    np.testing.assert_allclose(np.sort(free[1]), [0.01, 0.02, 0.03], rtol=0.03)
+    np.testing.assert_allclose(np.sort(free[1]), [0.02, 0.04, 0.08], rtol=0.03)
     assert np.all(np.sort(found.damping_ratio[0, 0, 0, 0]) > 5 * np.sort(free[0]))
 
 
@@ -355,7 +358,9 @@ def test_idle_channels_change_nothing():
 
 @pytest.fixture(scope="module")
 def move():
-    return run_fast_move(STUDY)
+    """Of the default study, which waits until vibration has decayed."""
+    long = paper_study().change(link__modes=3, motion__waypoints=STUDY.motion.waypoints)
+    return run_fast_move(long)
 
 
 def test_the_fast_move_is_a_run_with_and_without_control(move):
@@ -390,14 +395,31 @@ CHANGE = BreakingChange(
 )
 
 
-def few(monkeypatch, move):
-    """A command that looks at few plants, for no change, and has a fast move."""
-    monkeypatch.setattr(
-        spillover_run, "smallest_change", lambda design, units: CHANGE._replace(tolerances=units)
-    )
-    chosen = {"bases": ("pinned_pinned",), "mismatches": patch_lengths((0.8, 1.0)), "sizes": (3, 9)}
-    monkeypatch.setattr(spillover_run, "certify", partial(certify, **chosen))
-    monkeypatch.setattr(spillover_run, "run_fast_move", move)
+@pytest.fixture
+def few(move):
+    """A command that looks at few plants, for no change, and has a fast move.
+
+    What is replaced here is part of no program: they are kept.
+    """
+    plants = {"bases": ("pinned_pinned",), "mismatches": patch_lengths((0.8, 1.0)), "sizes": (3, 9)}
+    with mock.patch.multiple(
+        spillover_run,
+        smallest_change=lambda design, units: CHANGE._replace(tolerances=units),
+        certify=partial(certify, **plants),
+        run_fast_move=lambda study: move,
+    ):
+        yield
+
+
+@pytest.fixture
+def undrawn():
+    """Figures are not drawn."""
+    with mock.patch.object(
+        spillover_run.figures,
+        "save",
+        lambda _, out, name, __: (out / f"{name}.png").write_bytes(b"-"),
+    ):
+        yield
 
 
 def write(folder, **changes):
@@ -406,8 +428,8 @@ def write(folder, **changes):
     return path
 
 
-def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_path, move):
-    few(monkeypatch, lambda study: move)
+@pytest.mark.usefixtures("few")
+def test_command_passes_a_design_and_writes_everything(capsys, tmp_path, move):
     design, out = write(tmp_path), tmp_path / "deep" / "out"
     code, text, _ = run(
         capsys, "spillover", design, "--out", out, "--pdf", "--tolerance", "patch=5e-4"
@@ -444,8 +466,8 @@ def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_
         np.testing.assert_array_equal(store.residual_rms.sel(control="off"), move.residual_rms[1])
 
 
-def test_another_design_s_certificate_is_left_alone(capsys, monkeypatch, tmp_path, move):
-    few(monkeypatch, lambda study: move)
+@pytest.mark.usefixtures("few")
+def test_another_design_s_certificate_is_left_alone(capsys, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     kept = json.dumps({"study": STUDY.change(control__gain_factor=0.1).model_dump(mode="json")})
@@ -455,32 +477,20 @@ def test_another_design_s_certificate_is_left_alone(capsys, monkeypatch, tmp_pat
     assert (out / "certificate.json").read_text() == kept
 
 
-def test_a_certificate_is_made_again_in_its_folder(capsys, monkeypatch, tmp_path, move):
+@pytest.mark.usefixtures("few", "undrawn")
+def test_a_certificate_is_made_again_in_its_folder(capsys, tmp_path):
     """Also that of a design whose ratios come from its own run and are written as numbers."""
-    few(monkeypatch, lambda study: move)
-    monkeypatch.setattr(
-        spillover_run.figures,
-        "save",
-        lambda _, out, name, __: (out / f"{name}.png").write_bytes(b"-"),
-    )
     design, out = write(tmp_path, control__ratio_source="own_run"), tmp_path / "out"
     for _ in range(2):
         assert run(capsys, "spillover", design, "--out", out)[0] in (0, 1)
     assert (out / "certificate.json").exists()
 
 
-def test_command_fails_a_design(capsys, monkeypatch, tmp_path):
-    def refuse(study):
-        raise StudyError("not today")
-
-    few(monkeypatch, refuse)
-    monkeypatch.setattr(
-        spillover_run.figures,
-        "save",
-        lambda _, out, name, __: (out / f"{name}.png").write_bytes(b"-"),
-    )
+@pytest.mark.usefixtures("few", "undrawn")
+def test_command_fails_a_design(capsys, tmp_path):
     design, out = write(tmp_path, **DIFFERENCE), tmp_path / "out"
-    code, text, _ = run(capsys, "spillover", design, "--out", out, "--margin", "1.5")
+    with mock.patch.object(spillover_run, "run_fast_move", side_effect=StudyError("not today")):
+        code, text, _ = run(capsys, "spillover", design, "--out", out, "--margin", "1.5")
     assert code == 1 and "failed by mode" in text and "unstable" in text
     assert "no fast move: not today" in text
     report = text_of((out / "report.html").read_text(encoding="utf-8"))
@@ -494,32 +504,20 @@ def test_command_fails_a_design(capsys, monkeypatch, tmp_path):
     assert not data["is_passed"]
 
 
-def test_command_fails_a_design_with_an_unstable_machine_in_its_box(
-    capsys, monkeypatch, tmp_path, move
-):
-    few(monkeypatch, lambda study: move)
+@pytest.mark.usefixtures("few", "undrawn")
+def test_command_fails_a_design_with_an_unstable_machine_in_its_box(capsys, tmp_path):
     box = ProvenBox(BOX, 1.0, True, 12, cells=0, seconds=0.0, unstable=(0.95, 1.0, 0.1))
-    monkeypatch.setattr(spillover_run, "prove", lambda _: Proofs(AllModes(3.5, 3.7, 12), box))
-    monkeypatch.setattr(
-        spillover_run.figures,
-        "save",
-        lambda _, out, name, __: (out / f"{name}.png").write_bytes(b"-"),
-    )
-    out = tmp_path / "out"
-    code, text, _ = run(capsys, "spillover", write(tmp_path), "--out", out, "--prove")
+    proofs, out = Proofs(AllModes(3.5, 3.7, 12), box), tmp_path / "out"
+    with mock.patch.object(spillover_run, "prove", lambda _: proofs):
+        code, text, _ = run(capsys, "spillover", write(tmp_path), "--out", out, "--prove")
     assert code == 1 and "passed" not in text
     wanted = "failed by an unstable machine in the box: stiffness x 0.95, 1 sample of extra delay"
     assert wanted in text and "on the plants: gain margin 2.88, 2 required" in text
     assert not json.loads((out / "certificate.json").read_text())["is_passed"]
 
 
-def test_a_certificate_is_written_whole_or_not_at_all(capsys, monkeypatch, tmp_path, move):
-    few(monkeypatch, lambda study: move)
-    monkeypatch.setattr(
-        spillover_run.figures,
-        "save",
-        lambda _, out, name, __: (out / f"{name}.png").write_bytes(b"-"),
-    )
+@pytest.mark.usefixtures("few", "undrawn")
+def test_a_certificate_is_written_whole_or_not_at_all(capsys, tmp_path):
     design, out = write(tmp_path), tmp_path / "out"
     (out / "report.html").mkdir(parents=True)
     (out / ".unfinished-killed").mkdir()

@@ -2,17 +2,16 @@
 
 import tomllib
 
-import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxmodel.prepare import prepare
 from studies import Study, StudyError, load_study, paper_study, parse_study
-from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.explain import allowed_values
 from studies.study.template import STARTERS, starter_template, study_template, toml_value
+from studies.verify.prepared import prepared
+from tests.canonical import MACHINE, study_of
 
 REFUSED = [
     # unknown or misspelt
@@ -316,9 +315,8 @@ def test_what_is_no_study_is_refused(data):
 
 def test_damping_by_mode_and_link_reaches_the_plant():
     measured = [[0.02, 0.01], [0.03], [0.01, 0.02]]
-    study = paper_study().change(link__damping_ratio=measured, link__damping_law="stiffness")
-    structure, case = build_structure(study), as_arrays(build_case(study))
-    plant = jax.jit(prepare, static_argnums=0)(structure, case).loop.plant
+    study = study_of(MACHINE, link__damping_ratio=measured, link__damping_law="stiffness")
+    plant = prepared(study)[2].loop.plant
     zeta = plant.damping / (2 * np.sqrt(plant.stiffness * plant.modal_mass[:, None]))
     np.testing.assert_allclose(zeta[0, :3], [0.02, 0.01, 0.01 * 9 / 4], rtol=1e-9)
     np.testing.assert_allclose(zeta[1, :3], [0.03, 0.12, 0.27], rtol=1e-9)

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import textwrap
 from types import SimpleNamespace
+from unittest import mock
 
 import jax
 import numpy as np
@@ -16,13 +17,13 @@ from studies.errors import StudyError
 from studies.space.axes import Range
 from studies.space.free import Free, FreeNumbers
 from studies.study.spec import paper_study
-from studies.tuning import loop_figures
+from studies.tuning import linear_fidelity, loop_figures
 from studies.tuning.check import tuned_study
 from studies.tuning.evaluate import Evaluation
 from studies.tuning.folder import load_progress, save_progress
-from studies.tuning.linear_fidelity import LinearFidelity
+from studies.tuning.linear_fidelity import BATCH, LinearFidelity
 from studies.tuning.loop_figures import machine_figures
-from studies.tuning.optimise import advance, begin, optimise, start_families
+from studies.tuning.optimise import advance, begin, first_places, optimise, start_families
 from studies.tuning.report import violated_limits
 from studies.tuning.run import make_evaluator
 from studies.tuning.scenarios import scenario_columns, tuned_machines
@@ -46,50 +47,53 @@ JUDGED = {
         "all": {"set": {"shaper.kind": "zv"}},
     },
 }
-STARTS = 7
+FREE = {
+    **GAIN,
+    "control.velocity_gain[0]": EVERY_KIND["control.velocity_gain"],
+    "drive.kp": EVERY_KIND["drive.kp"],
+    "placement": {"kind": "same"},
+}
+STARTS = 2
+
+
+def few_modes():
+    """Loops of fewer plant modes: a third of the time to compile."""
+    return mock.patch.object(loop_figures, "MARGIN_MODES", 4)
 
 
 @pytest.fixture(scope="module")
 def judged():
     """A tuning with two families and free numbers of several kinds, and its evaluator."""
-    free = {
-        **GAIN,
-        "control.velocity_gain[0]": EVERY_KIND["control.velocity_gain"],
-        "drive.kp": EVERY_KIND["drive.kp"],
-    }
-    spec = tuning({**free, "placement": {"kind": "same"}}, **JUDGED, starts=STARTS, iterations=6)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loop_figures, "MARGIN_MODES", 4)  # a third of the time to compile
-        yield spec, make_evaluator(spec)
+    spec = tuning(FREE, **JUDGED, starts=STARTS, iterations=6)
+    with few_modes():
+        return spec, make_evaluator(spec)
 
 
 @pytest.fixture(scope="module")
 def evaluated(judged):
-    """The evaluation of a design of each family and of its neighbours along some free numbers."""
+    """The evaluation of a design of each family, and of its neighbours along the free numbers."""
     spec, evaluator = judged
-    u, p = np.clip(spec.free.places() + 0.02, 0.1, 0.9), len(spec.free.names)
-    found = {}
-    for numbers in ([0, 1, 2], [3, 4, 5]):
-        step = 1e-4 * np.eye(p)[numbers]
-        designs = np.tile(np.concatenate([[u], u + step, u - step]), (2, 1))
-        found[tuple(numbers)] = evaluator.evaluate(spec.free.values(designs))
-    return spec, u, found
+    u = np.clip(spec.free.places() + 0.02, 0.1, 0.9)
+
+    def at(*places):
+        return evaluator.evaluate(spec.free.values(np.tile(places, (2, 1))))
+
+    return spec, u, at(u, u), [at(u + step, u - step) for step in 1e-4 * np.eye(len(u))]
 
 
 @pytest.mark.parametrize("family", [0, 1])
 def test_gradients_are_those_of_central_differences(evaluated, family):
-    spec, u, found = evaluated
+    spec, u, found, beside = evaluated
     first = family * STARTS
     assert spec.limit_names == tuple(JUDGED["limits"])
-    central, own = [], []
-    for numbers, part in found.items():
+    central = []
+    for part in beside:
         assert (part.status == 0).all()
         values = np.concatenate([part.objective[:, None], part.limits], axis=1)
-        up, down = values[first + 1 : first + 4], values[first + 4 : first + 7]
-        central.append((up - down) / 2e-4)
-        slopes = np.concatenate([part.slope[:, None], part.limit_slope], axis=1)[first]
-        own.append((slopes * spec.free.slopes(u)).T[list(numbers)])
-    central, own = np.concatenate(central), np.concatenate(own)
+        central.append((values[first] - values[first + 1]) / 2e-4)
+    central = np.array(central)
+    slopes = np.concatenate([found.slope[:, None], found.limit_slope], axis=1)[first]
+    own = (slopes * spec.free.slopes(u)).T
     is_free = spec.moving[family].is_free
     assert (own[~is_free] == 0).all() and is_free.sum() == (2, 6)[family]
     largest = np.abs(central).max(axis=0)
@@ -99,8 +103,8 @@ def test_gradients_are_those_of_central_differences(evaluated, family):
 
 def test_figures_can_be_recomputed_from_runs(evaluated):
     """The objective and the limit from runs of the studies themselves, one by one."""
-    spec, u, found = evaluated
-    part, values = found[0, 1, 2], spec.free.values(u)
+    spec, u, found, _ = evaluated
+    values = spec.free.values(u)
     columns = scenario_columns(spec, 2, 0)
     objective, excess = [], []
     for k in range(4):
@@ -124,28 +128,28 @@ def test_figures_can_be_recomputed_from_runs(evaluated):
             np.sqrt(np.mean(getattr(after, name) ** 2) / np.mean(getattr(before, name) ** 2))
             for name in ("residual_rms", "control_energy")
         ]
-        loops = [
-            machine_figures(spec, study, machine, ("slowest_decay",))["slowest_decay"][0]
-            for study in (spec.study, spec.study.change(**tuned))
-        ]
+        with few_modes():
+            loops = [
+                machine_figures(spec, study, machine, ("slowest_decay",))["slowest_decay"][0]
+                for study in (spec.study, spec.study.change(**tuned))
+            ]
         shares.append(loops[0] / loops[1])  # more is better
         objective.append(np.dot(shares, (1.0, 0.1, 0.2)) / 1.3)
         excess.append(after.peak_voltage.max() / before.peak_voltage.max() - 1)
     assert len(set(objective)) == 4
-    np.testing.assert_allclose(part.objective[0], np.mean(objective), rtol=1e-7)
-    np.testing.assert_allclose(part.limits[0, 0], np.max(excess), rtol=1e-6)
+    np.testing.assert_allclose(found.objective[0], np.mean(objective), rtol=1e-7)
+    np.testing.assert_allclose(found.limits[0, 0], np.max(excess), rtol=1e-6)
 
 
 def test_limits_of_the_loop_are_those_of_the_worst_machine(evaluated):
-    spec, u, found = evaluated
+    spec, u, found, _ = evaluated
     machines, names = tuned_machines(spec).columns, spec.loop_limits
     assert len(machines["link.youngs_modulus"]) == 2
     for position, first in ((0, 0), (1, STARTS)):
         study = tuned_study(spec, spec.moving[position], spec.free.values(u))
-        loop, limits = (
-            machine_figures(spec, study, machines, names),
-            found[0, 1, 2].limits[first, 1:],
-        )
+        with few_modes():
+            loop = machine_figures(spec, study, machines, names)
+        limits = found.limits[first, 1:]
         margin = loop["gain_margin"].min()
         assert (limits[0] > 0) == (margin < 4.0) and abs(margin - 4) > 0.01
         for value, excess in (
@@ -155,6 +159,17 @@ def test_limits_of_the_loop_are_those_of_the_worst_machine(evaluated):
         ):
             wanted = excess.max()
             np.testing.assert_allclose(value, wanted / (1 + abs(wanted)), rtol=1e-6, atol=1e-9)
+
+
+def test_a_design_that_fails_spoils_no_other(judged, evaluated):
+    """A drive that no step carries makes one design's runs diverge."""
+    (spec, evaluator), (_, u, wanted, _) = judged, evaluated
+    values = spec.free.values(np.tile(u, (2 * STARTS, 1)))
+    values[-1, 2] = 1e12
+    found = evaluator.evaluate(values)
+    assert np.isnan(found.objective[-1]) and (found.status[-1] != 0).all()
+    for name in ("objective", "slope", "limits", "limit_slope", "status"):
+        np.testing.assert_array_equal(getattr(found, name)[:-1], getattr(wanted, name)[:-1])
 
 
 @pytest.mark.parametrize(
@@ -169,7 +184,7 @@ def test_a_baseline_needs_a_stable_loop_to_be_measured_against(tune, message):
     text = " baseline is unstable on machine 2 of 2, .*; allowed: > 0 on every machine of tune"
     weak = {"count": 2, "check": 1, "machines": {"control.velocity_gain": [[3e3] * 3] * 2}}
     spec = tuning({"drive.kp": EVERY_KIND["drive.kp"]}, scenarios=weak, **tune)
-    with pytest.raises(StudyError, match=message + ".*" + text.strip()):
+    with few_modes(), pytest.raises(StudyError, match=message + ".*" + text.strip()):
         LinearFidelity(spec, list(spec.families))
 
 
@@ -185,20 +200,58 @@ def test_an_objective_can_be_of_the_loop_alone():
     assert (found.status == 0).all() and slope != 0
 
 
-# --- downhill -------------------------------------------------------------------------------------
+@pytest.fixture
+def screened():
+    """What is screened, with made-up figures: gain_factor - 1 is the largest excess of the limits,
+    velocity_gain the residual, lost below 2.
+    """
+    seen = []
+
+    def known(structure, names, place, numbers, limits, links, values):
+        assert names == tuple(JUDGED["limits"])[1:] and len(values) == BATCH
+        seen.extend(values)
+        residual = np.where(values[:, 1] < 2, np.nan, values[:, 1])
+        return values[:, :1] * 0.1 / limits - 1, residual
+
+    with mock.patch.object(linear_fidelity, "screen_designs", known):
+        yield seen
 
 
-@pytest.fixture(scope="module")
-def tuned(judged):
-    """Where an uninterrupted tuning ends, and every iteration of it."""
+def test_the_best_of_what_is_screened_is_a_start(judged, screened):
+    """That with the least residual within the limits."""
+    spec, evaluator = judged
+    values = spec.free.values(np.random.default_rng(0).uniform(size=(20, len(spec.free.names))))
+    beyond, residual = evaluator.linear.screen(0, values)
+    np.testing.assert_allclose(beyond, values[:, 0] - 1)  # 0.1 is the smallest limit
+    np.testing.assert_array_equal(residual, np.where(values[:, 1] < 2, np.inf, values[:, 1]))
+    del screened[:]
+    places, seen = first_places(spec, evaluator), np.array(screened)
+    for k, family in enumerate(spec.moving):
+        own, other = places[STARTS * k : STARTS * (k + 1)]
+        np.testing.assert_array_equal(own, spec.free.places())
+        assert (other == own)[~family.is_free].all()
+        mine = seen[BATCH * k : BATCH * (k + 1)]
+        is_fine = (mine[:, 0] <= 1) & (mine[:, 1] >= 2)
+        assert 0 < is_fine.sum() < BATCH
+        assert spec.free.values(other)[1] == pytest.approx(mine[is_fine, 1].min(), rel=1e-12)
+
+
+@pytest.mark.long  # in short: with made-up figures
+def test_a_screen_says_what_an_evaluation_does():
+    """On the nominal machine, of the limits of the loop."""
+    spec = tuning(FREE, **JUDGED | {"scenarios": {}})
+    linear = LinearFidelity(spec, list(spec.moving))
+    values = spec.free.values(np.tile(np.clip(spec.free.places() + 0.02, 0.1, 0.9), (2, 1)))
+    beyond, residual = linear.screen(1, values[:1])
+    np.testing.assert_allclose(beyond[0], linear.evaluate(values).limits[1].max(), rtol=1e-9)
+    assert np.isfinite(residual).all()
+
+
+@pytest.mark.usefixtures("screened")
+def test_tuning_goes_downhill_within_limits(judged):
     spec, evaluator = judged
     seen = []
-    return optimise(spec, evaluator, None, seen.append), seen
-
-
-def test_tuning_goes_downhill_within_limits(judged, tuned):
-    spec, _ = judged
-    end, seen = tuned
+    end = optimise(spec, evaluator, None, seen.append)
     assert int(end.iteration) == len(seen) == spec.tune.iterations
     for family in (0, 1):
         k = end.winner(family)
@@ -211,53 +264,6 @@ def test_tuning_goes_downhill_within_limits(judged, tuned):
     assert not violated_limits(spec, end)
 
 
-def test_resumed_tuning_equals_an_uninterrupted_one(judged, tuned, tmp_path):
-    """Bit by bit, through the file that is kept."""
-    spec, evaluator = judged
-    end, seen = tuned
-    save_progress(tmp_path / "progress.npz", seen[3])
-    again = optimise(spec, evaluator, load_progress(tmp_path / "progress.npz"), lambda at: None)
-    jax.tree.map(np.testing.assert_array_equal, again, end)
-
-
-@pytest.mark.parametrize("method", ["lbfgs", pytest.param("adam", marks=pytest.mark.long)])
-def test_a_start_that_fails_spoils_no_other(judged, method):
-    """A drive that no step carries makes one design's runs diverge."""
-    spec, evaluator = judged
-    spec = spec._replace(tune=spec.tune.model_copy(update={"method": method}))
-    at = begin(spec, evaluator)
-    for _ in range(2):
-        at = advance(spec, evaluator, at)
-
-    def stiff(values):
-        values = values.copy()
-        values[9, 2] = 1e12
-        return evaluator.evaluate(values)
-
-    broken = SimpleNamespace(evaluate=stiff, is_free=evaluator.is_free)
-    wanted, found = advance(spec, evaluator, at), advance(spec, broken, at)
-    others = np.arange(2 * STARTS) != 9
-    assert not found.is_frozen.any()
-    np.testing.assert_array_equal(found.place[others], wanted.place[others])
-    assert np.isnan(found.history[2, 9]).all() and np.isfinite(found.place[9]).all()
-    assert found.best_objective[9] == at.best_objective[9]
-    assert np.abs(found.place[9] - found.base[9]).max() < np.abs(at.place[9] - at.base[9]).max()
-    no_best = np.where(others, at.best_objective, np.inf)
-    lost = advance(spec, broken, at._replace(best_objective=no_best))
-    assert lost.is_frozen[9] and not lost.is_frozen[others].any()
-    np.testing.assert_array_equal(lost.place[others], wanted.place[others])
-
-
-def test_a_number_that_changes_nothing_is_named(judged, monkeypatch):
-    spec, evaluator = judged
-    found = evaluator.evaluate(spec.free.values(np.tile(spec.free.places(), (2 * STARTS, 1))))
-    others = np.array(spec.free.names) != "drive.kp"
-    found = found._replace(slope=found.slope * others, limit_slope=found.limit_slope * others)
-    monkeypatch.setattr(evaluator, "evaluate", lambda values: found)
-    with pytest.raises(StudyError, match=r"family 'all' neither .* depends on drive.kp; leave"):
-        optimise(spec, evaluator, None, lambda at: None)
-
-
 # --- known answers --------------------------------------------------------------------------------
 
 
@@ -268,14 +274,15 @@ class Known:
         self.families = [spec.moving[k] for k in start_families(spec)]
         self.is_free = np.stack([family.is_free for family in self.families])
         self.linear = SimpleNamespace(screen=lambda k, values: np.zeros((2, len(values))))
-        self._function = jax.jit(jax.vmap(jax.value_and_grad(function)))
-        self._limits = limits or (lambda x: np.zeros(0))
+        limits = limits or (lambda x: jax.numpy.zeros(0))
+
+        def one(x):
+            return *jax.value_and_grad(function)(x), limits(x), jax.jacfwd(limits)(x)
+
+        self._evaluate = jax.jit(jax.vmap(one))
 
     def evaluate(self, values, needs_gradient=True):
-        objective, slope = map(np.asarray, self._function(values))
-        limits = np.array([self._limits(x) for x in values])
-        each = [jax.jacfwd(self._limits)(x) for x in values] if limits.size else None
-        change = np.array(each) if each else np.zeros((*limits.shape, values.shape[1]))
+        objective, slope, limits, change = map(np.asarray, self._evaluate(values))
         zero = np.zeros((len(values), 1))
         return Evaluation(objective, slope, limits, change, limits, zero, zero[:, 0])
 
@@ -290,7 +297,63 @@ def known_tuning(spans, limits=(), **tune):
     return TuneSpec(paper_study(), tune, free, (family,), ({},), {})
 
 
+def bowl(method="lbfgs", depends=(1.0, 1.0)):
+    """A tuning of two numbers with a limit, its evaluator, and its start at four places."""
+    spans = {name: Range(0.0, 1.0, 0, False) for name in "xy"}
+    spec = known_tuning(spans, ("peak_voltage",), method=method, starts=4, iterations=8)
+    share = np.array(depends)
+    evaluator = Known(
+        spec,
+        lambda v: share @ (jax.numpy.sin(3 * v) - v) ** 2,
+        lambda v: jax.numpy.stack([share @ v - 1.5]),
+    )
+    place = np.random.default_rng(0).uniform(size=(4, 2))
+    return spec, evaluator, begin(spec, evaluator)._replace(place=place, base=place)
+
+
+def test_resumed_tuning_equals_an_uninterrupted_one(tmp_path):
+    """Bit by bit, through the file that is kept."""
+    (spec, evaluator, at), seen = bowl(), []
+    end = optimise(spec, evaluator, at, seen.append)
+    save_progress(tmp_path / "progress.npz", seen[3])
+    again = optimise(spec, evaluator, load_progress(tmp_path / "progress.npz"), lambda at: None)
+    jax.tree.map(np.testing.assert_array_equal, again, end)
+    assert len(seen) == spec.tune.iterations
+
+
 @pytest.mark.parametrize("method", ["lbfgs", "adam"])
+def test_a_start_that_fails_spoils_no_other(method):
+    """It tries a shorter step, or is given up if it has never finished."""
+    spec, evaluator, at = bowl(method)
+    for _ in range(2):
+        at = advance(spec, evaluator, at)
+    others = np.arange(4) != 2
+
+    def failing(values):
+        found = evaluator.evaluate(values)
+        slope = np.where(others[:, None], found.slope, np.nan)
+        return found._replace(objective=np.where(others, found.objective, np.nan), slope=slope)
+
+    broken = SimpleNamespace(evaluate=failing, is_free=evaluator.is_free)
+    wanted, found = advance(spec, evaluator, at), advance(spec, broken, at)
+    assert not found.is_frozen.any()
+    np.testing.assert_array_equal(found.place[others], wanted.place[others])
+    assert np.isnan(found.history[2, 2]).all() and np.isfinite(found.place[2]).all()
+    assert found.best_objective[2] == at.best_objective[2]
+    assert np.abs(found.place[2] - found.base[2]).max() < np.abs(at.place[2] - at.base[2]).max()
+    no_best = np.where(others, at.best_objective, np.inf)
+    lost = advance(spec, broken, at._replace(best_objective=no_best))
+    assert lost.is_frozen[2] and not lost.is_frozen[others].any()
+    np.testing.assert_array_equal(lost.place[others], wanted.place[others])
+
+
+def test_a_number_that_changes_nothing_is_named():
+    spec, evaluator, at = bowl(depends=(1.0, 0.0))
+    with pytest.raises(StudyError, match=r"family 'known' neither .* depends on y; leave"):
+        optimise(spec, evaluator, at, lambda at: None)
+
+
+@pytest.mark.parametrize("method", ["lbfgs", pytest.param("adam", marks=pytest.mark.long)])
 def test_optimal_damping_of_one_mode(method):
     """A released oscillator leaves the least integral of x^2 with zeta = 1/2."""
 

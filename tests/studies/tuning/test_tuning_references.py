@@ -1,10 +1,12 @@
 """What a tuned design has to beat: no control, and the best gain factor alone."""
 
+from unittest import mock
+
 import numpy as np
 import pytest
 
+from studies.engine import function
 from studies.engine.frame import frame_of
-from studies.engine.function import TRACES
 from studies.engine.preflight import check_run
 from studies.engine.runs import run_study
 from studies.tuning import loop_figures, references
@@ -47,12 +49,13 @@ def compared():
         starts=1,
         scenarios={"count": 2, "check": 2, "spread": {"link.youngs_modulus": 5.0}},
     )
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(references, "COUNT", 7)
-        patch.setattr(loop_figures, "MARGIN_MODES", 4)  # a third of the time to compile
-        before = len(TRACES)
+    with (
+        mock.patch.object(references, "COUNT", 7),
+        mock.patch.object(loop_figures, "MARGIN_MODES", 4),  # a third of the time to compile
+        mock.patch.object(function, "_FUNCTIONS", {}) as made,
+    ):
         found = compare(spec, [spec.study], lambda text: None)
-        assert len(TRACES) == before + 1  # the scan takes the program of the fresh machines
+        assert len(made) == 1  # the scan takes the program of the fresh machines
         scan = found[2].scan
         machines = tuned_machines(spec).columns
         loops = [

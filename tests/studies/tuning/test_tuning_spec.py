@@ -1,6 +1,7 @@
 """Free numbers of a tuning and what a tuning file may ask for."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -13,6 +14,7 @@ from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.numbers import one_study
 from studies.study.paths import Parts, set_value
 from studies.study.spec import parse_study
+from studies.tuning import evaluate
 from studies.tuning.evaluate import Evaluator
 from studies.tuning.objective import (
     ScenarioFigures,
@@ -589,11 +591,46 @@ def test_parameters_belong_to_a_law(free, families, message):
         tuning(free, families=families)
 
 
-def test_designs_of_laws_are_evaluated_in_order():
-    """Families of two laws side by side: each design as in a tuning of its own law."""
-    free = {**GAIN, "control.laws.ppf.filter_damping": {"from": 0.2, "to": 1.0}}
-    other = {"set": {"control.law": "ppf"}}
-    spec = tuning(free, families={"a": {}, "ppf": other, "b": {}}, starts=1)
+TWO_LAWS = {**GAIN, "control.laws.ppf.filter_damping": {"from": 0.2, "to": 1.0}}
+BY_LAW = {"a": {}, "ppf": {"set": {"control.law": "ppf"}}, "b": {}}
+
+
+class KnownRuns:
+    """Runs whose residual is a law's size times 1 + 2 gain_factor + filter_damping."""
+
+    SIZE, SLOPE, compile_time = {"imsc": 1.0, "ppf": 3.0}, np.array([2.0, 1.0]), 1.0
+
+    def __init__(self, structure, layout, place):
+        self._size = self.SIZE[structure.law]
+
+    def differentiate(self, numbers, free):
+        size = self._size * (1 + np.where(np.isnan(free), 1.0, free) @ self.SLOPE)
+        metrics = Metrics({"residual_rms": size[:, None, None] * np.ones((3, 3))})
+        result = SimpleNamespace(metrics=metrics, status=np.zeros(len(free), int))
+
+        def pull_back(cotangents):
+            by_size = np.asarray(cotangents.residual_rms).sum(axis=(2, 3))
+            return by_size[..., None] * self._size * self.SLOPE
+
+        return SimpleNamespace(result=result, pull_back=pull_back)
+
+
+def test_designs_of_laws_are_evaluated_in_order(monkeypatch):
+    """Families of two laws side by side, measured against the baseline of one of them."""
+    monkeypatch.setattr(evaluate, "Executor", KnownRuns)
+    spec = tuning(TWO_LAWS, families=BY_LAW, starts=1)
+    names = [family.name for family in spec.moving]
+    values = {"a": [0.3, np.nan], "ppf": [0.2, 0.4], "b": [0.6, np.nan]}
+    found = Evaluator(spec, list(spec.moving)).evaluate(np.array([values[x] for x in names]))
+    known = {"a": 2.6 / 4, "ppf": 3 * 1.8 / 4, "b": 3.2 / 4}
+    slopes = {"a": [0.5, 0.0], "ppf": [1.5, 0.75], "b": [0.5, 0.0]}
+    np.testing.assert_allclose(found.objective, [known[x] for x in names], rtol=1e-12)
+    np.testing.assert_allclose(found.slope, [slopes[x] for x in names], rtol=1e-12)
+
+
+@pytest.mark.long  # in short: with known runs
+def test_designs_of_laws_are_evaluated_as_in_tunings_of_their_own():
+    spec = tuning(TWO_LAWS, families=BY_LAW, starts=1)
     evaluator = Evaluator(spec, list(spec.moving))
     places = np.array([[0.3, 0.5], [0.2, 0.4], [0.6, 0.5]])
     found = evaluator.evaluate(spec.free.values(places))

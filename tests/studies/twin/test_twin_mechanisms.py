@@ -1,6 +1,9 @@
 """Mechanisms of rails and cranks in the twin: their joints, frequencies, motion and loop."""
 
+from functools import partial
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -28,6 +31,22 @@ LENGTH, THICKNESS = np.array([0.2, 0.21, 0.19]), np.array([2.0e-3, 2.2e-3, 1.8e-
 NEAR_MASS = np.array([0.15, 0.12, 0.2])
 
 _prepare = jax.jit(prepare, static_argnums=0)
+
+
+@partial(jax.jit, static_argnums=0)
+def _joints(structure, case, poses):
+    """Of the model: positions along the carriers' paths, near and far ends of the links."""
+    plant = prepare(structure, case).loop.plant
+
+    def one(pose):
+        chain = kinematics.close_chain(plant, pose, 0 * pose)
+        away = jnp.stack(chain.near.to_far(), axis=1)
+        far = jnp.broadcast_to(jnp.stack(chain.far).T, away.shape)
+        return chain.rho, jnp.stack([far - away, far], axis=1)
+
+    return jax.vmap(one)(poses)
+
+
 _linearise = jax.jit(linearise, static_argnums=0)
 
 
@@ -51,17 +70,13 @@ def off_home(name, seed):
 def test_joints_are_those_of_the_model(name):
     """By other trigonometry."""
     structure, case = with_unequal_links(name, link__modes=1)
-    loop = _prepare(structure._replace(n_steps=1), case).loop
     machine = describe_machine(structure, case)
-    for seed in range(20):
-        pose = off_home(name, seed)
-        rho, ends = close_chain(machine, pose)
-        chain = kinematics.close_chain(loop.plant, pose, 0 * pose)
-        away = np.stack(chain.near.to_far(), axis=1)
-        far = np.broadcast_to(np.array(chain.far).T, away.shape)
-        near = far - away
-        np.testing.assert_allclose(rho, chain.rho, rtol=0, atol=1e-14)
-        np.testing.assert_allclose(ends, np.stack([near, far], axis=1), rtol=0, atol=1e-14)
+    poses = np.array([off_home(name, seed) for seed in range(20)])
+    each = map(np.asarray, _joints(structure._replace(n_steps=1), case, poses))
+    for pose, rho, ends in zip(poses, *each, strict=True):
+        found = close_chain(machine, pose)
+        np.testing.assert_allclose(found[0], rho, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(found[1], ends, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("name", MACHINES)

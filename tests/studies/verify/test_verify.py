@@ -7,19 +7,22 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import NamedTuple
+from unittest import mock
 
 import jsonschema
 import numpy as np
 import pytest
 from rich.console import Console
 
+from jaxmodel.shaper import SHAPERS, Impulses
 from studies import passport
 from studies.show.document import schema
 from studies.study.spec import load_study, paper_study, parse_study
-from studies.verify import commands, loops, run, stepping, trajectories
+from studies.verify import commands, links, loops, run, stepping, trajectories
 from studies.verify.prepared import prepared
 from studies.verify.rows import Assumption, largest, worst, worst_relative
 from tests import TOP
+from tests.canonical import TINY, study_of, with_sections
 from tests.machines import random_machine
 from tests.studies.test_cli import run as call
 
@@ -162,8 +165,6 @@ FAULTS = {
     ),
 }
 
-#: Faults tried in the quick tests.
-QUICK = ("wrong S", "amplitude of a shaper")
 _CHECK = """
 import json, sys
 from studies.config import start
@@ -202,10 +203,8 @@ def copied(folder: Path, fault: Fault | None) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(x, marks=() if x in QUICK else pytest.mark.long) for x in FAULTS],
-)
+@pytest.mark.long  # in short: as if two of them were in the code
+@pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_makes_a_row_fail(name, tmp_path):
     fault = FAULTS[name]
     failed = failed_rows(copied(tmp_path, fault), fault.group, 400)
@@ -218,31 +217,40 @@ def test_the_copy_without_a_fault_passes(tmp_path):
 
 
 REST = {"motion": {"waypoints": [[0.0, 0.0, 0.52]]}}
-SMALL = {"link": {"modes": 1}, "control": {"modes": 1}, "patches": {"centers": [0.1]}}
 
 
 @pytest.mark.parametrize("points", [1, 2])
 def test_steps_of_a_machine_at_rest(points):
     motion = {"waypoints": REST["motion"]["waypoints"] * points}
-    error, order = stepping._steps(parse_study(SMALL | {"motion": motion}))
+    error, order = stepping._steps(parse_study(with_sections(TINY, motion=motion)))
     assert error.outcome == "passed" and 0 < error.difference < 1e-6
     assert order.left_out == "the step is exact to rounding"
 
 
 def test_steps_say_why_their_order_is_left_out():
-    heavy = {"load": {"wrench": [1.0, 0.0, 0.0]}}
-    assert "friction" not in stepping._steps(parse_study(SMALL | heavy))[1].left_out
+    def known(structure, n_samples, case, parts, *others):
+        return stepping.Stepped(np.full((n_samples, 3, 3), 1 + parts**-4.0), None)
+
+    with mock.patch.object(stepping, "_step", known):
+        study = study_of(TINY)
+        _, order = stepping._steps(study)
+        assert order.outcome == "passed" and order.note == "order 4.00"
+        for changes, word in (
+            ({"load__wrench": (1.0, 0.0, 0.0)}, "load.wrench"),
+            ({"drive__coulomb_friction": 1.0}, "friction"),
+        ):
+            assert stepping._steps(study.change(**changes))[1].left_out.startswith(word)
 
 
-@pytest.mark.parametrize("points", [1, 2])
+@pytest.mark.parametrize("points", [1, pytest.param(2, marks=pytest.mark.long)])
 def test_machine_code_at_rest(points):
     motion = {"waypoints": REST["motion"]["waypoints"] * points}
-    row = stepping._kernel(parse_study(SMALL | {"motion": motion}))
+    row = stepping._kernel(parse_study(with_sections(TINY, motion=motion)))
     assert row.outcome == "passed" and row.allowed == 1e-8
 
 
 def test_an_unstable_loop_has_no_linear_run():
-    study = parse_study(SMALL)
+    study = study_of(TINY)
     assert loops._release(study).outcome == "passed"
     assert "unstable" in loops._release(study.change(control__gain_factor=1e3)).left_out
 
@@ -251,7 +259,8 @@ def test_an_unstable_loop_has_no_linear_run():
     ("kind", "hertz"), [("zv", [458.0]), ("ei3", [1030.0]), ("zv", [90, 1030])]
 )
 def test_shapers_of_fast_modes(kind, hertz):
-    study = parse_study({"shaper": {"kind": kind, "frequencies_hz": list(map(float, hertz))}})
+    shaper = {"kind": kind, "frequencies_hz": list(map(float, hertz))}
+    study = parse_study(with_sections(TINY, shaper=shaper, run={"duration": 0.05}))
     _, case, found = prepared(study)
     assert trajectories._taps(study, case, found.taps).outcome == "passed"
     detuned = study.change(shaper__frequencies_hz=[2 * x for x in hertz])
@@ -261,7 +270,7 @@ def test_shapers_of_fast_modes(kind, hertz):
 @pytest.mark.parametrize("command", ["'", "/bin/false", "no_such_compiler"])
 def test_a_bad_compiler_costs_one_row(command, monkeypatch):
     monkeypatch.setenv("CC", command)
-    row = loops._exported(parse_study(SMALL))
+    row = loops._exported(study_of(TINY))
     assert row.assumption == "exported C controller"
     assert row.outcome == ("FAILED" if command == "/bin/false" else "left out")
 
@@ -269,13 +278,44 @@ def test_a_bad_compiler_costs_one_row(command, monkeypatch):
 CHEAP = ("links and patches", "trajectories and shapers", "mechanics")
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_random_machines_pass(seed):
+def drawn(seed):
+    """A random machine, its links with or without loads at their ends."""
     shaper = {"kind": "ei_damped", "frequencies_hz": [100.0, 410.0], "split": "exact"}
     basis = {"basis": ("pinned_pinned", "loaded")[seed % 2]}
-    study = random_machine(seed, link=basis, shaper=shaper)
+    return random_machine(seed, link=basis, shaper=shaper)
+
+
+# in short: the other basis in the next test, but for the mechanics
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long)])
+def test_random_machines_pass(seed):
+    study = drawn(seed)
     rows = [row for name in CHEAP for row in run.CHECKS[name](study)]
     assert len(rows) == 12 and all(row.is_passed for row in rows), rows
+
+
+def test_a_fault_fails_its_row():
+    """Half the shortening, and another amplitude of a shaper, as if in the code."""
+    shapes, shapers, ei = links._shapes, trajectories._shapers, list(SHAPERS).index("ei")
+
+    def short(*arguments):
+        basis, *others = shapes(*arguments)
+        return basis._replace(shortening=basis.shortening / 2), *others
+
+    def weak(*arguments):
+        amplitude, time = map(np.array, shapers(*arguments))
+        amplitude[ei, [0, 2]] -= 0.025
+        return Impulses(amplitude, time)
+
+    study = drawn(2)
+    with (
+        mock.patch.object(links, "_shapes", short),
+        mock.patch.object(trajectories, "_shapers", weak),
+    ):
+        rows = [row for name in CHEAP[:2] for row in run.CHECKS[name](study)]
+    assert [row.assumption.split(" ")[0] for row in rows if not row.is_passed] == [
+        "modal",
+        "insensitivity",
+    ]
 
 
 @pytest.mark.long
