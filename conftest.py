@@ -15,6 +15,7 @@ from typing import Any
 
 import jaxlib
 import pytest
+from threadpoolctl import threadpool_limits
 
 from studies import config
 from studies.engine import function, programs
@@ -22,6 +23,9 @@ from studies.engine.programs import drop_programs
 
 pytest_plugins = ["tests.budget"]
 
+# threads of BLAS wait for each other's turns where other workers have the cores; children, too
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+threadpool_limits(1, "blas")
 FLAGS = "--xla_backend_optimization_level=0"
 # without the threshold for small loops, which takes a sixth of the time to compile
 FLAGS += " --xla_backend_extra_options=xla_cpu_use_multi_output_fusion"

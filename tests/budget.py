@@ -20,6 +20,7 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,22 +32,24 @@ from tests import TOP
 TABLE = TOP / "tests" / "budget.tsv"
 #: JAX's name for lowering a program, once for each that is traced.
 TRACED = "/jax/core/compile/jaxpr_to_mlir_module_duration"
-#: Share by which a measured cost may grow before the table must say so.
-SLACK = 1.5
 #: Processor time that no file need answer for [s].
 LEAST = 4.0
 #: Time of the fixed piece of work where the table was written [s].
-WORK = 0.1
+WORK = 0.05
 
 
 class Cost(NamedTuple):
     """Of all tests of a file."""
 
-    programs: int = 0
+    programs: float = 0
     seconds: float = 0.0  # of processor time, children included
 
-    def plus(self, programs: int, seconds: float) -> Cost:
+    def plus(self, programs: float, seconds: float) -> Cost:
         return Cost(self.programs + programs, self.seconds + seconds)
+
+
+#: What a file may cost over what was measured: another worker beside it makes processors slower.
+SLACK = Cost(1.25, 2.0)
 
 
 def read_table() -> dict[str, Cost]:
@@ -156,30 +159,35 @@ def _processor_time() -> float:
     return sum(os.times()[:4])
 
 
+def measured(name: str) -> Cost:
+    """What a file costs in a process of its own that finds no program kept."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "spent.json"
+        more = {"STUDIES_TESTS_SPENT": str(out), "JAX_COMPILATION_CACHE_DIR": folder}
+        subprocess.run(
+            [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", name],
+            env=os.environ | more,
+            cwd=TOP,
+            stdout=subprocess.DEVNULL,
+            timeout=1800,
+        )
+        spent = json.loads(out.read_text(encoding="utf-8"))
+    return Cost(*spent.get(name, ()))
+
+
 def measure(files: list[str]) -> None:
-    """Write what files cost, each in a process of its own that finds no program kept."""
-    table = read_table() if TABLE.exists() else {}
+    """Write what files may cost, or all of them."""
     there = [str(x.relative_to(TOP)) for x in sorted((TOP / "tests").rglob("test_*.py"))]
-    table = {name: cost for name, cost in table.items() if name in there}
-    for name in files or there:
-        with tempfile.TemporaryDirectory() as folder:
-            out = Path(folder) / "spent.json"
-            more = {"STUDIES_TESTS_SPENT": str(out), "JAX_COMPILATION_CACHE_DIR": folder}
-            subprocess.run(
-                [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", name],
-                env=os.environ | more,
-                cwd=TOP,
-                stdout=subprocess.DEVNULL,
-                timeout=1800,
-            )
-            spent = json.loads(out.read_text(encoding="utf-8"))
-        programs, seconds = spent.get(name, (0, 0.0))
-        seconds *= WORK / fixed_work()
-        table[name] = Cost(math.ceil(SLACK * programs), math.ceil(SLACK * seconds))
-        print(name, *table[name], flush=True)
-        rows = [("file", *Cost._fields), *((x, *y) for x, y in sorted(table.items()))]
-        text = "".join("\t".join(map(str, row)) + "\n" for row in rows)
-        TABLE.write_text(text, encoding="utf-8")
+    table = {name: cost for name, cost in read_table().items() if name in there}
+    names, work = files or there, WORK / fixed_work()
+    with ThreadPoolExecutor(2) as pool:
+        for name, cost in zip(names, pool.map(measured, names), strict=True):
+            seconds = SLACK.seconds * work * cost.seconds
+            table[name] = Cost(math.ceil(SLACK.programs * cost.programs), math.ceil(seconds))
+            print(name, *table[name], flush=True)
+    rows = [("file", *Cost._fields), *((x, *y) for x, y in sorted(table.items()))]
+    text = "".join("\t".join(map(str, row)) + "\n" for row in rows)
+    TABLE.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

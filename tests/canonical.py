@@ -24,12 +24,12 @@ def _move(length: float, time: float) -> dict[str, Any]:
     return {"waypoints": [HOME, [0.0, length, HOME[2]]], "move_time": time}
 
 
-#: Two modes, 200 samples: 2 mm in 10 ms.
+#: Two modes, 200 samples: 0.5 mm in 10 ms.
 TINY: dict[str, Any] = {
     "run": {"duration": 0.02},
     "link": {"modes": 2},
     "control": {"modes": 2, "ratios": [[1.0, 0.3]] * 3},
-    "motion": _move(0.002, 0.01),
+    "motion": _move(0.0005, 0.01),
     "shaper": {"kind": "none"},
     "metrics": {"residual_delay": 0.0, "residual_length": 0.008},
 }

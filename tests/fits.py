@@ -116,7 +116,8 @@ class Ringing:
         time = np.linspace(0.0, 0.06, 601)
 
         def value(x):
-            omega = 2 * np.pi * (90.0 + 20 * signal.link + 7 * signal.patch) * np.sqrt(x[0] / 7e10)
+            hertz = 90.0 + 20 * signal.link + 7 * signal.patch
+            omega = 2 * np.pi * hertz * np.sqrt(x[0] / 7e10 / (1 + x[2]))
             size = (5.0 + 2 * signal.link - signal.patch) / (1 + x[2])
             return size * np.exp(-10 * x[1] * omega * time) * np.sin(omega * time + signal.link)
 

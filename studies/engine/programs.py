@@ -17,6 +17,7 @@ import os
 import pickle
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from functools import cache, cached_property, update_wrapper
 from pathlib import Path
@@ -127,8 +128,8 @@ def kept_jit(
 
     Args:
         static_argnums: arguments that are part of the program. With others than numbers, texts,
-            tuples of them and `Placing`, the program is not kept: no name tells a function from
-            another.
+            `...`, tuples of them and `Placing`, the program is not kept: no name tells a function
+            from another.
         is_quick: compiled with `quick_options`.
 
     Example:
@@ -146,7 +147,7 @@ def is_plain(x: Any) -> bool:
         return is_plain(x.arguments)
     if isinstance(x, tuple):
         return all(map(is_plain, x))
-    return x is None or isinstance(x, bool | int | float | str)
+    return x is None or x is ... or isinstance(x, bool | int | float | str)
 
 
 def program(names: list[Any], arguments: list[Any], lower: Callable[[], Any], module: str) -> Any:
@@ -201,10 +202,11 @@ def _load_or_compile(name: str, lower: Callable[[], Any], modules: Iterable[str]
     lowered = lower()
     with without_jax_cache():
         compiled = lowered.compile()
-    payload, *trees = serialize(compiled)
-    # not every tree's structure can be pickled, but a tree of numbers
-    examples = [jax.tree.unflatten(tree, range(tree.num_leaves)) for tree in trees]
-    entry.keep(pickle.dumps((payload, *examples)))
+    with suppress(RuntimeError):  # XLA cannot write every program, and keeping only saves time
+        payload, *trees = serialize(compiled)
+        # not every tree's structure can be pickled, but a tree of numbers
+        examples = [jax.tree.unflatten(tree, range(tree.num_leaves)) for tree in trees]
+        entry.keep(pickle.dumps((payload, *examples)))
     return compiled
 
 

@@ -47,10 +47,9 @@ def promised(kind: type) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def made():
-    """One of each, with what stands before its promised axes."""
+    """One of each, traced but not computed, with what stands before its promised axes."""
     structure = build_structure(STUDY)
 
-    @jax.jit
     def make(case):
         loop = prepare(structure, case).loop
         response = loop_response(structure, case, loop, case.path.waypoints[0])
@@ -59,7 +58,10 @@ def made():
         result = simulate(structure, case, has_record=True)
         return basis, loop.plant, loop.controller, response, assembled_modes(response), result
 
-    basis, plant, controller, response, modes, result = make(as_arrays(build_case(STUDY)))
+    shapes = jax.eval_shape(make, as_arrays(build_case(STUDY)))
+    basis, plant, controller, response, modes, result = jax.tree.map(
+        lambda x: np.empty(x.shape, x.dtype), shapes
+    )
     return {
         "basis": (basis, ""),
         "plant": (plant, ""),

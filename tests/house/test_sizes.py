@@ -5,6 +5,7 @@ import ast
 import pytest
 
 from tests import TOP
+from tests.house.test_house import SOURCES
 
 #: Calls whose arguments are sizes or shapes.
 SHAPED = {
@@ -125,15 +126,15 @@ def is_counted(node):
     return is_named and any(word in ast.unparse(node) for word in words)
 
 
-def found_in(source):
-    return {ast.unparse(node) for node in ast.walk(ast.parse(source)) if looks_like_a_size(node)}
+def found_in(tree):
+    return {ast.unparse(node) for node in ast.walk(tree) if looks_like_a_size(node)}
 
 
 def test_no_literal_stands_for_a_number_of_links_or_coordinates():
     found = {}
-    for path in (*TOP.glob("jaxmodel/**/*.py"), *TOP.glob("studies/**/*.py")):
+    for path, tree in SOURCES.items():
         name = path.relative_to(TOP).as_posix()
-        if not name.startswith(OF_ONE_MACHINE) and (own := found_in(path.read_text())):
+        if not name.startswith(OF_ONE_MACHINE) and (own := found_in(tree)):
             found[name] = own
     assert found == {name: set(own) for name, own in OTHERS.items()}
 
@@ -143,4 +144,4 @@ def test_no_literal_stands_for_a_number_of_links_or_coordinates():
     ["np.zeros((3, n))", "x[..., :3]", "(True,) * 3", "3 * n_patches", "range(3)", "len(x) != 3"],
 )
 def test_what_is_looked_for_is_found(line):
-    assert found_in(line)
+    assert found_in(ast.parse(line))

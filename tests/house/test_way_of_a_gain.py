@@ -12,12 +12,13 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import pytest
 
 import jaxmodel
 import studies
 from studies.cli import main
-from studies.engine import plan
-from tests.studies.sweeps.test_sweep_commands import toml_of
+from tests.canonical import TINY, text_of
+from tests.sweeps import narrow_blocks
 
 #: Modules that hold the gain today. The aim is 18.
 LIMIT = 31
@@ -84,10 +85,15 @@ def module_of(code):
     return ""
 
 
-def test_few_modules_hold_a_gain_between_its_file_and_its_results(tmp_path, monkeypatch):
-    monkeypatch.setattr(plan, "LANES", 8)
+@pytest.fixture(autouse=True)
+def small_blocks():
+    with narrow_blocks():
+        yield
+
+
+def test_few_modules_hold_a_gain_between_its_file_and_its_results(tmp_path):
     path = tmp_path / "gains.toml"
-    path.write_text(toml_of(SWEEP))
+    path.write_text(text_of(TINY) + SWEEP)
     command = ["sweep", str(path), "--quiet", "--out"]
     main([*command, str(tmp_path / "compiled")])  # calls that trace programs are not its way
     way = Way()

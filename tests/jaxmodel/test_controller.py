@@ -12,7 +12,8 @@ from jaxmodel.controller import CORNER, adc_code, read_back, soft_limit
 def test_smooth_limit_is_the_sharp_one_with_round_corners():
     bound = 100.0
     x = np.linspace(-250, 250, 5001)
-    smooth, sharp = (np.asarray(soft_limit(x, bound, kind)) for kind in (True, False))
+    limit = jax.jit(soft_limit, static_argnums=2)
+    smooth, sharp = (np.asarray(limit(x, bound, kind)) for kind in (True, False))
     far = np.abs(np.abs(x) / bound - 1) >= CORNER
     np.testing.assert_allclose(smooth[far], sharp[far], rtol=1e-14)
     assert np.max(np.abs(smooth - sharp)) <= bound * CORNER / 4 * (1 + 1e-9)
@@ -21,7 +22,7 @@ def test_smooth_limit_is_the_sharp_one_with_round_corners():
 
 def test_slope_of_the_smooth_limit_has_no_jump():
     x = np.linspace(-200, 200, 40001)
-    slope = np.asarray(jax.vmap(jax.grad(lambda v: soft_limit(v, 100.0, True)))(x))
+    slope = np.asarray(jax.jit(jax.vmap(jax.grad(lambda v: soft_limit(v, 100.0, True))))(x))
     assert slope.min() == 0 and slope.max() == 1
     assert np.max(np.abs(np.diff(slope))) < 1.1 * (x[1] - x[0]) / (2 * CORNER * 100)
 

@@ -141,7 +141,7 @@ def test_nothing_drains_a_gauge():
     assert paper_study().patches.sensor == "piezo"
 
 
-@pytest.mark.parametrize("basis", ["pinned_pinned", "loaded"])
+@pytest.mark.parametrize("basis", ["pinned_pinned", pytest.param("loaded", marks=pytest.mark.long)])
 def test_verification_of_the_links_knows_gauges(basis):
     study = parse_study({**BASE, "patches": GAUGES, "link": {"modes": 3, "basis": basis}})
     for row in check_links(study):

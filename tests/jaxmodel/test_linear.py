@@ -12,7 +12,9 @@ from jaxmodel.loop import PlantState
 from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import prepare
 from jaxmodel.return_difference import assembled_modes, loop_response
-from jaxmodel.simulate import _about, simulate
+from jaxmodel.simulate import _about
+from studies.engine.programs import kept_jit
+from studies.engine.runs import _simulate
 from studies.reference import tables
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import paper_study
@@ -31,6 +33,14 @@ def linear_plant(structure, case):
 def linear(study):
     plant = linear_plant(build_structure(study), as_arrays(build_case(study)))
     return jax.tree.map(np.asarray, plant)
+
+
+_prepare = kept_jit(static_argnums=0)(prepare)
+response = jax.jit(frequency_response)
+
+
+def prepared(study):
+    return _prepare(build_structure(study), as_arrays(build_case(study)))
 
 
 @pytest.mark.parametrize("name", tables.HELD)
@@ -104,10 +114,8 @@ def test_response_of_a_locked_link_to_its_actuators_is_the_modal_sum():
     study = UNDAMPED.change(link__damping_ratio=0.01, drive__locked=True)
     plant = linear(study)
     frequency = np.array([1.0, 60.0, 114.39, 300.0, 457.5])
-    found = np.asarray(frequency_response(plant, plant.deflection, plant.voltage, frequency))
-    loop = jax.jit(prepare, static_argnums=0)(
-        build_structure(study), as_arrays(build_case(study))
-    ).loop
+    found = np.asarray(response(plant, plant.deflection, plant.voltage, frequency))
+    loop = jax.tree.map(np.asarray, prepared(study).loop)
     omega, s = np.asarray(loop.omega[0]), 2j * np.pi * frequency[:, None]
     receptance = 1 / (s**2 + 0.02 * omega * s + omega**2)  # per modal mass, as is the actuator
     modal_sum = np.einsum(
@@ -122,10 +130,8 @@ def test_static_response_of_the_free_machine_is_that_of_its_springs():
     """At rest on the drive a voltage bends its own link by sum Y_j Q_j/k_j and moves nothing."""
     study = UNDAMPED.change(link__damping_ratio=0.01, drive__kd=60.0)
     plant = linear(study)
-    found = np.array(frequency_response(plant, plant.deflection, plant.voltage, np.zeros(1)))[0]
-    loop = jax.jit(prepare, static_argnums=0)(
-        build_structure(study), as_arrays(build_case(study))
-    ).loop
+    found = np.array(response(plant, plant.deflection, plant.voltage, np.zeros(1)))[0]
+    loop = jax.tree.map(np.asarray, prepared(study).loop)
     bending = np.asarray(loop.actuator / loop.omega[:, :, None] ** 2)
     static = np.einsum("isr,irk->isk", np.asarray(loop.deflection_at), bending)
     scale = np.abs(static).max()
@@ -164,7 +170,8 @@ def test_released_link_moves_like_the_finite_element_link():
         metrics__stations=(0.5,),
     )
     structure, case = build_structure(study), as_arrays(build_case(study))
-    record = jax.jit(simulate, static_argnums=(0, 2))(structure, case, True).record
+    few = structure._replace(metrics=("residual_rms",), n_frequencies=1)
+    record = _simulate(few, case, True).record
     deflection = np.asarray(record.chord_deflection_stations)[:, :, 0]
     np.testing.assert_allclose(record.time[::2], time, atol=1e-12)
     np.testing.assert_allclose(deflection[::2, 0], given, atol=0.001 * 5e-5)

@@ -313,11 +313,15 @@ def test_settling_time_is_that_of_the_rigid_machine():
     study = parse_study(CRANKED)
     inertia, rates = rigid_machine(study)
     structure, case = case_of("rrr")
-    shaped = jax.tree.map(
-        lambda x, like: np.broadcast_to(x, np.shape(like)), build_case(study).machine, case.machine
+    own, machine = build_case(study).machine, case.machine
+    parts = jax.tree.map(  # what a mechanism has of its own, in shapes of a program above
+        lambda x, like: np.broadcast_to(x, np.shape(like)),
+        (own.geometry, own.masses),
+        (machine.geometry, machine.masses),
     )
+    machine = machine._replace(geometry=parts[0], masses=parts[1])
     home = np.array(study.motion.waypoints[-1])
-    plant, _ = linear_forms(structure, case._replace(machine=shaped), home)
+    plant, _ = linear_forms(structure, case._replace(machine=machine), home)
     np.testing.assert_allclose(rates, plant.slide, atol=1e-12)
     np.testing.assert_allclose(inertia, plant.mass, rtol=1e-9, atol=1e-15)
 

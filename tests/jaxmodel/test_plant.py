@@ -107,7 +107,12 @@ _response = jax.jit(controller_response)
 
 
 @pytest.mark.parametrize(
-    "control", [{}, {"law": "lqg"}, {"feedthrough_factor": 0.7, "notch_hz": [0.0, 800.0, 0.0]}]
+    "control",
+    [
+        {},
+        pytest.param({"law": "lqg"}, marks=pytest.mark.long),
+        {"feedthrough_factor": 0.7, "notch_hz": [0.0, 800.0, 0.0]},
+    ],
 )
 def test_a_controller_is_the_same_system_in_either_form(control):
     study = parse_study(SHORT | {"control": control})

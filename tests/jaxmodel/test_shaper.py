@@ -60,7 +60,7 @@ def sampled(taps, period=PERIOD):
 def test_amplitudes_sum_to_one(kind, omega, zeta, tolerance):
     impulses = design(index(kind), omega, zeta, tolerance)
     assert impulses.amplitude.shape == impulses.time.shape == (MAX_IMPULSES,)
-    np.testing.assert_allclose(jnp.sum(impulses.amplitude), 1, rtol=2e-15)
+    np.testing.assert_allclose(np.sum(impulses.amplitude), 1, rtol=2e-15)
     assert np.all(np.isfinite(impulses.time)) and np.all(impulses.time >= 0)
 
 
@@ -244,25 +244,26 @@ def test_exact_split_keeps_the_zero_where_the_linear_split_loses_it():
 def test_splits_are_harmless(kind, omega, zeta):
     """Weights sum to one, lie next to their impulse; the exact one only scales the mode's V."""
     impulses = design(index(kind), omega, zeta, 0.05)
-    exact, linear = exactly(impulses, PERIOD, omega, zeta), linearly(impulses, PERIOD)
+    found = exactly(impulses, PERIOD, omega, zeta), linearly(impulses, PERIOD)
+    impulses, exact, linear = jax.tree.map(np.asarray, (impulses, *found))
     for taps in (exact, linear):
         assert taps.weight.shape == taps.sample.shape == (2 * MAX_IMPULSES,)
-        assert jnp.issubdtype(taps.sample.dtype, jnp.integer)
-        np.testing.assert_allclose(jnp.sum(taps.weight), 1, rtol=3e-15)
+        assert np.issubdtype(taps.sample.dtype, np.integer)
+        np.testing.assert_allclose(np.sum(taps.weight), 1, rtol=3e-15)
         assert np.all(taps.weight >= -1e-10) and np.all(taps.sample >= 0)
-        away = jnp.abs(taps.sample * PERIOD - jnp.tile(impulses.time, 2))
+        away = np.abs(taps.sample * PERIOD - np.tile(impulses.time, 2))
         assert np.all(away <= PERIOD * (1 + 1e-9))
-        assert not np.any(taps.weight[jnp.tile(impulses.amplitude == 0, 2)])
+        assert not np.any(taps.weight[np.tile(impulses.amplitude == 0, 2)])
 
     def vector(amplitude, time):
         pole = omega * (-zeta + 1j * np.sqrt(1 - zeta**2))
-        return jnp.sum(amplitude * jnp.exp(-pole * time))
+        return np.sum(amplitude * np.exp(-pole * time))
 
     # Before renormalisation the exact split is the same vector; afterwards its real multiple.
-    ratio = vector(*sampled(exact)) * jnp.conj(vector(*impulses))
+    ratio = vector(*sampled(exact)) * np.conj(vector(*impulses))
     assert abs(ratio.imag) < 1e-11 * (1 + abs(ratio.real))
-    mean_delay = jnp.sum(linear.weight * linear.sample) * PERIOD
-    np.testing.assert_allclose(mean_delay, jnp.sum(jnp.prod(jnp.stack(impulses), 0)), atol=1e-15)
+    mean_delay = np.sum(linear.weight * linear.sample) * PERIOD
+    np.testing.assert_allclose(mean_delay, np.sum(np.prod(np.stack(impulses), 0)), atol=1e-15)
 
 
 def test_impulse_on_the_grid_stays_one_impulse():
@@ -273,10 +274,11 @@ def test_impulse_on_the_grid_stays_one_impulse():
 
 
 def test_traced_kinds_in_one_batch():
-    kinds = jnp.arange(len(SHAPERS))
-    omega, zeta = OMEGA * jnp.linspace(0.8, 1.2, len(SHAPERS)), jnp.linspace(0, 0.2, len(SHAPERS))
-    v = jnp.linspace(0.03, 0.1, len(SHAPERS))
-    amplitude, time = jax.jit(jax.vmap(design_shaper))(kinds, omega, zeta, v)
+    kinds = np.arange(len(SHAPERS))
+    omega, zeta = OMEGA * np.linspace(0.8, 1.2, len(SHAPERS)), np.linspace(0, 0.2, len(SHAPERS))
+    v = np.linspace(0.03, 0.1, len(SHAPERS))
+    found = jax.jit(jax.vmap(design_shaper))(kinds, omega, zeta, v)
+    amplitude, time = map(np.asarray, found)
     for k, kind in enumerate(SHAPERS):
         mode = (omega[k], zeta[k])
         alone = {
@@ -340,16 +342,17 @@ def test_gradients_are_finite_at_the_limits(kind):
 
 def test_gradient_of_no_vibration_is_zero():
     silent = Impulses(jnp.zeros(2), jnp.array([0.0, 0.01]))
-    assert jax.grad(residual_vibration, 1)(silent, OMEGA, 0.1) == 0
+    assert jax.jit(jax.grad(residual_vibration, 1))(silent, OMEGA, 0.1) == 0
 
 
 def test_exact_splits_in_series_cancel_both_modes():
     """Split for its own mode and only then put in series, each ZV still cancels its mode."""
     period, modes = 1e-4, ((2 * np.pi * 114.39, 0.01), (2 * np.pi * 457.55, 0.02))
-    first, second = (split_exact(zv(*mode), period, *mode) for mode in modes)
-    taps = in_series(first, second)
+    series = jax.jit(in_series)
+    first, second = (exactly(zv(*mode), period, *mode) for mode in modes)
+    taps = series(first, second)
     on_grid = Impulses(taps.weight, taps.sample * period)
     for omega, zeta in modes:
-        assert residual_vibration(on_grid, omega, zeta) < 1e-12
-    linear = in_series(*(split_linear(zv(*mode), period) for mode in modes))
-    assert residual_vibration(Impulses(linear.weight, linear.sample * period), *modes[1]) > 1e-4
+        assert residual(on_grid, omega, zeta) < 1e-12
+    linear = series(*(linearly(zv(*mode), period) for mode in modes))
+    assert residual(Impulses(linear.weight, linear.sample * period), *modes[1]) > 1e-4

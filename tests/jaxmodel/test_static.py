@@ -18,7 +18,7 @@ from jaxmodel.prepare import prepare
 from studies.engine.margins import judge_loops
 from studies.engine.programs import kept_jit
 from studies.engine.run_data import chord_deflection
-from studies.engine.runs import run_study
+from studies.engine.runs import Run, _simulate
 from studies.engine.stability import loop_report
 from studies.fitting.bench import Bench, response
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure, case_of
@@ -246,22 +246,23 @@ def test_deflections_at_the_stations_have_it():
 
 def test_mid_span_of_a_run_is_the_station_there():
     """Reported afterwards, from modes and commands, behind slow amplifiers."""
-    run = run_study(
-        paper_study().change(
-            link__modes=2,
-            control__modes=2,
-            control__ratios=((1.5, 2.0),) * 3,
-            electronics__amplifier_hz=300.0,
-            run__duration=0.06,
-            motion__waypoints=paper_study().motion.waypoints[:2],
-            motion__move_time=0.02,
-            shaper__kind="none",
-            metrics__stations=(0.5,),
-            metrics__residual_length=0.01,
-            metrics__residual_delay=0.0,
-        ),
-        has_loop=False,
+    study = paper_study().change(
+        link__modes=2,
+        control__modes=2,
+        control__ratios=((1.5, 2.0),) * 3,
+        electronics__amplifier_hz=300.0,
+        run__duration=0.06,
+        motion__waypoints=paper_study().motion.waypoints[:2],
+        motion__move_time=0.02,
+        shaper__kind="none",
+        metrics__stations=(0.5,),
+        metrics__residual_length=0.01,
+        metrics__residual_delay=0.0,
     )
+    structure, case = build_structure(study), build_case(study)
+    few = structure._replace(metrics=("residual_rms",), n_frequencies=1)
+    result = jax.tree.map(np.asarray, _simulate(few, case, True))
+    run = Run(study, structure, case, result, int(result.status))
     station = np.asarray(run.result.record.chord_deflection_stations)[:, :, 0]
     size = np.abs(station).max()
     np.testing.assert_allclose(chord_deflection(run), station, rtol=0, atol=1e-12 * size)

@@ -370,8 +370,8 @@ def ideal(gain):
         ),
         (changed(control=ideal(1e3), run={"substeps": 1}), "run.substeps = 1; allowed: "),
         (
-            changed(control={"modes": 2}, electronics={"lowpass_ratio": [3.0, 11.0]}),
-            "low-pass corners below half the sample rate, 5000 Hz; the highest of the 2 is at 5033",
+            changed(electronics={"lowpass_ratio": [3.0, 11.0]}),
+            "low-pass corners below half the sample rate, 5000 Hz; the highest of the 3 is at 1132",
         ),
         (changed(link={"length": 0.01}), "patches.actuator_length = 0.03; allowed: at"),
         (

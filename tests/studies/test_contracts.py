@@ -389,6 +389,9 @@ def wrong(tmp_path_factory):
     yield from taken_in(tmp_path_factory.mktemp("wrong") / "wrong_parts.py", WRONG)
 
 
+POSE_SUM = "total 'pose_sum': shape (3,) after a sample, () before"
+
+
 @pytest.mark.parametrize(
     ("changes", "command", "message"),
     [
@@ -403,7 +406,8 @@ def wrong(tmp_path_factory):
             "wrong_parts.py, line 14: TracerBool",
         ),
         ({"control__law": "turns"}, "simulate", "velocity_gain is complex; expected real numbers"),
-        ({}, "sweep", "total 'pose_sum': shape (3,) after a sample, () before"),
+        ({}, "simulate", POSE_SUM),
+        pytest.param({}, "sweep", POSE_SUM, marks=pytest.mark.long),
         ({"sweep": "nowhere"}, "sweep", "sweep.method = 'nowhere': gives float64 of shape (2, 1)"),
         ({"sweep": "none"}, "sweep", "sweep.method = 'none': gives float64 of shape (0, 1)"),
         ({}, "export --target up", "it makes '../up.txt'; expected a plain file name"),

@@ -1,42 +1,28 @@
 """Float32 on request, and one controlled mode: a run of both against float64."""
 
-import subprocess
-import sys
-
+import jax
 import numpy as np
 
 from jaxmodel import status
 from studies.engine.runs import run_study
-from tests.canonical import TINY, study_of
+from tests.studies.engine.test_batch import short_study
 
-STUDY = study_of(TINY, control__modes=1, control__gain_factor=0.1)
-SCRIPT = """
-import sys
-sys.path.insert(0, sys.argv[1])
-from studies import config
-config.configure("float32")
-config.keep_programs()
-from studies.engine.runs import run_study
-from tests.studies.test_precision import STUDY
-result = run_study(STUDY, has_record=False, has_loop=False).result
-rms = result.metrics.residual_rms
-print(rms.dtype, int(result.status), *map(float, rms.ravel()))
-"""
+STUDY = short_study(link__modes=2, control__modes=1, shaper__kind="zv")
 
 
-def test_float32_runs_and_agrees_with_float64(pytestconfig):
-    whole = run_study(STUDY, has_record=False, has_loop=False).result
-    assert whole.metrics.residual_rms.dtype == np.float64
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT, str(pytestconfig.rootpath)],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=True,
-    )
-    kind, code, *values = done.stdout.split()
-    assert kind == "float32" and int(code) == int(whole.status) == status.OK
-    wanted = whole.metrics.residual_rms.ravel()
-    error = np.abs(np.array(values, float) - wanted).max() / wanted.max()
+def run():
+    return run_study(STUDY, has_record=False, has_loop=False).result
+
+
+def test_float32_runs_and_agrees_with_float64():
+    """That `studies.configure` turns it on: tests/studies/test_config.py."""
+    whole = run()
+    with jax.enable_x64(False):
+        single = run()
+    kinds = [result.metrics.residual_rms.dtype for result in (whole, single)]
+    assert kinds == [np.float64, np.float32]
+    assert single.status == whole.status == status.OK
+    wanted = whole.metrics.residual_rms
+    error = np.abs(single.metrics.residual_rms - wanted).max() / wanted.max()
     assert error < 0.02, error
     assert error > 0  # two precisions, not one

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from unittest.mock import patch
 
 import jax
 import numpy as np
@@ -11,14 +12,14 @@ from studies import cli
 from studies.bench import peers
 from studies.bench.works import WORKS
 from studies.engine.executor import Executor
+from studies.study.spec import paper_study
 
 KEYS = "work executor configs_per_s compile_s peak_mib device dtype batch steps fingerprint"
 
 
 @pytest.fixture(scope="module")
 def work():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(WORKS["W0"], "link__modes", 3)
+    with patch.dict(WORKS["W0"], link__modes=3):
         return peers.make_work(is_short=True)
 
 
@@ -62,13 +63,25 @@ def test_gradient_figures(monkeypatch, capsys):
     assert found["parameters"] == 3 and found["configs_per_s"] > 0 < found["fingerprint"]
 
 
-def test_single_precision_is_measured_against_double(monkeypatch, capsys):
+#: One mode, one short move.
+SHORT = {
+    "link__modes": 1,
+    "control__modes": 1,
+    "run__duration": 0.05,
+    "motion__waypoints": paper_study().motion.waypoints[:2],
+    "motion__move_time": 0.03,
+    "metrics__residual_delay": 0.0,
+    "metrics__residual_length": 0.015,
+}
+
+
+def test_single_precision_is_measured_against_double(capsys):
     """Also where a thread of its own has no precision of its own, as the executor's."""
-    monkeypatch.setitem(WORKS["W0"], "link__modes", 1)
-    monkeypatch.setitem(WORKS["W0"], "control__modes", 1)
-    monkeypatch.setattr("studies.bench.works.REPEATS", 1)
+    command = ["bench", "--work", "W0", "--batch", "16", "--precision", "float32", "--json"]
     try:
-        cli.main(["bench", "--work", "W0", "--batch", "16", "--precision", "float32", "--json"])
+        # not by monkeypatch: programs of this workload may be kept
+        with patch.dict(WORKS["W0"], SHORT), patch("studies.bench.works.REPEATS", 1):
+            cli.main(command)
     finally:
         jax.config.update("jax_enable_x64", True)
     found = json.loads(capsys.readouterr().out)

@@ -71,10 +71,10 @@ def test_a_bad_file_is_refused(sections, message):
 def test_a_tuning_is_on_the_machines_of_the_fit():
     measured = parse_measured(data(tune={"starts": 2}, commission={"gain_margin": 3.0}))
     machines = {"link.damping_ratio": np.linspace(0.01, 0.02, 20).tolist()}
-    section = tuning_section(measured, measured.study, machines)
+    section = tuning_section(measured, measured.study, machines, 1.1)
     spec = parse_tuning(measured.study.model_dump() | {"tune": section})
     assert spec.tune.starts == 2
-    assert spec.tune.limits["gain_margin"] == RESERVE * LOUDER * 3.0  # no gain was measured
+    assert spec.tune.limits["gain_margin"] == RESERVE * 1.1 * LOUDER * 3.0  # no measured gain
     assert spec.tune.scenarios.machines == machines
     assert "control.gain_factor" in spec.tune.free and "control.ratios" not in spec.tune.free
 

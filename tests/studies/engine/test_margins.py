@@ -381,6 +381,7 @@ def test_loops_without_feedback_have_no_limit():
         {"link__damping_ratio": 0.0, "control__links": (True, False, False)},
         {"link__damping_ratio": 1e-6, "control__links": (True, False, False)},
         {
+            "link__modes": 6,
             "link__damping_ratio": ((0.01,) * 6, (0.01,) * 6, (0.01,) * 5 + (7e-5,)),
             "control__gain_factor": 0.59,
         },

@@ -1,6 +1,7 @@
 """`studies export --compare`: one controller in several arithmetics and at several sample rates."""
 
 import json
+from types import SimpleNamespace
 
 import jsonschema
 import pytest
@@ -100,6 +101,27 @@ def test_the_cheapest_of_those_as_good_is_recommended():
     )
     assert cheapest(found) is made[3]
     assert cheapest(found._replace(variants=tuple(made[:1]))) is None
+    # the stillest of those that may be used decides what counts as much vibration
+    some = (made[1], made[3], variant(10e3, 32, 2.5, 0.5e-7, 0.5))
+    assert cheapest(found._replace(variants=some)) is some[2]
+
+
+def test_rows_of_the_table():
+    """Of what is exported, what rounds too much and what there is not, without a processor."""
+    made = (
+        variant(10e3, 0, 2.5, 1.234567e-7, None),
+        variant(10e3, 32, 2.25, 2e-6, None)._replace(rounding=0.25),
+        variant(20e3, 16, 2.5, 1e-7, None)._replace(rounding=20.0),
+        Variant(20e3, 32, fault="control.gain_factor = 5"),
+    )
+    study = SimpleNamespace(electronics=SimpleNamespace(sample_rate_hz=10e3))
+    rows = comparison._rows(SimpleNamespace(study=study, variants=made, board=None))
+    written = "studies export writes it"
+    assert rows[0] == ["10 (own)", "single precision", "2.5", "0.1235", "no bound", written]
+    assert [row[0] for row in rows] == ["10 (own)", "10 (own)", "20", "20"]
+    assert rows[1][2:] == ["2.25", "2", "0.25", written]
+    assert rows[2][2:5] == ["2.5", "0.1", "20"] and rows[2][5] != written
+    assert rows[3][2:] == ["", "", "", "none: control.gain_factor = 5"]
 
 
 def test_a_study_without_sampled_controller_is_refused(tmp_path):

@@ -34,7 +34,7 @@ TARGETS = ("json", "c", "c-fixed")
 @pytest.fixture(scope="module", autouse=True)
 def short_sequences():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sequences, "LENGTH", 600)
+        patch.setattr(sequences, "LENGTH", 300)
         yield
 
 

@@ -1,6 +1,7 @@
 """Arithmetic of exported controllers: formats, error bounds, rest, what does not fit."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -25,10 +26,10 @@ from studies.export.fixed import (
 )
 from studies.export.fixed_blocks import design_integers
 from studies.export.floating import respond as respond_floating
-from studies.export.in_the_loop import replay
+from studies.export.in_the_loop import LoopRun, replay
 from studies.export.integers import respond
 from studies.export.job import check_loop
-from studies.export.verify import reference_run
+from studies.export.verify import Check, Verification, reference_run, vibration
 from studies.study.spec import parse_study
 from tests.exports import KINDS, PAPER, SINGLE, TUNED, changed, found_and_codes, needs_compiler
 
@@ -196,6 +197,33 @@ def whole_run(found):
         return jax.lax.scan(partial(step, structure, loop), state, inputs)[1]
 
     return jax.tree.map(np.asarray, scan(start.loop, start.state, start.inputs))
+
+
+def run_of(codes, rms):
+    """A run with codes of one sensor and residual vibration by link and station."""
+    codes, count = np.array(codes)[:, None, None], len(codes)
+    result = SimpleNamespace(metrics=SimpleNamespace(residual_rms=np.array(rms)))
+    return LoopRun(codes, np.zeros((count, 1, 1)), np.zeros((count, 3)), result)
+
+
+def test_deviation_of_a_run():
+    """By hand: worst stations (4, 3) and (8, 6), rms 5 and 10 over the root of 2."""
+    runs = {
+        "JAX": run_of([1, 2, 3, 4], [[4.0, 1.0], [2.0, 3.0]]),
+        "C": run_of([1, 5, 3, 5], [[8.0, 2.0], [4.0, 6.0]]),
+        "same": run_of([1, 2, 3, 4], [[4.0, 0.0], [0.0, 3.0]]),
+    }
+    found = Verification(checks=[], notes=[], runs=runs, exchanges={}, counts={})
+    assert vibration(runs["JAX"]) == pytest.approx(5 / 2**0.5)
+    assert found.deviation("C").first_code == 1
+    assert found.deviation("C").loss == pytest.approx(1.0)
+    assert found.deviation("same")[2:] == (-1, 0.0)
+
+
+def test_one_comparison_that_fails_fails_the_verification():
+    good, bad = (Check("some codes", "1", "0", is_met) for is_met in (True, False))
+    found = Verification(checks=[good], notes=[], runs={}, exchanges={}, counts={})
+    assert found.is_passed and not found._replace(checks=[good, bad]).is_passed
 
 
 REFUSED = {

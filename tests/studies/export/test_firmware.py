@@ -31,7 +31,7 @@ from tests.studies.test_cli import refused, run
 @pytest.fixture(scope="module", autouse=True)
 def short_sequences():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sequences, "LENGTH", 600)
+        patch.setattr(sequences, "LENGTH", 300)
         yield
 
 
@@ -211,12 +211,12 @@ def test_a_stack_that_is_too_small_is_found(compared, monkeypatch):
 def test_a_program_that_hangs_is_ended(compared, monkeypatch):
     from studies.export.firmware import emulator
 
-    monkeypatch.setattr(emulator, "PATIENCE", 3.0)
+    monkeypatch.setattr(emulator, "PATIENCE", 1.0)
     code = compared.source.code.replace("state->fault = 0;", "for (;;) {}", 1)
     found = on_target.verify_on_target(
         compared._replace(source=compared.source._replace(code=code))
     )
-    assert "no answer for 3 s" in failed(found)["cortex-m4: runs to its end"]
+    assert "no answer for 1 s" in failed(found)["cortex-m4: runs to its end"]
 
 
 def built(compared, folder):

@@ -18,7 +18,7 @@ from studies.fitting.experiment import next_experiments
 from studies.fitting.kinds.modes import Measured, pair_modes
 from studies.fitting.report import describe_direction, is_good, sentences, summary
 from studies.fitting.run import run_fit
-from studies.fitting.solve import SAME, exchanges
+from studies.fitting.solve import SAME, Solution, exchanges
 from studies.fitting.statistics import UNKNOWN, describe_fit
 from studies.show.document import schema
 from studies.tuning.spec import load_tuning
@@ -273,6 +273,8 @@ def test_the_right_assignment_is_found_by_exchange():
     found = estimated("payload")
     np.testing.assert_allclose(found.answer.values, UNEQUAL, rtol=1e-3)
     assert is_good(found) and found.rivals == ()
+    unfinished = Solution((found.solution.best._replace(is_converged=False),), 1)
+    assert not is_good(found._replace(solution=unfinished))
     assert all(found.solution.rise(x) > 30 for x in found.solution.others)
 
 

@@ -143,7 +143,8 @@ def test_friction_from_the_motor_s_force_of_a_move(tmp_path):
     time = np.arange(0.0, 0.05, 2e-4)
     entry = TRACE | {"output": "motor 1", "sigma": 0.05}
     write(tmp_path, "trace.csv", time=time, value=np.ones(len(time)))
-    study = {"drive": {"friction_speed": 0.01}}
+    study = {"drive": {"friction_speed": 0.01}, "shaper": {"kind": "none"}}
+    study["control"] = {"modes": 2, "feedback": "none"}
     problem = posed(spec_of(tmp_path, entry, free=free, study=study))
     (one,), truth = problem.measurements, np.array([0.8, 9.0])
     exact, _ = one.predict(truth, False)

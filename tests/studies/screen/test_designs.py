@@ -37,15 +37,15 @@ from studies.store import Variable, read_store, write_store
 from tests.pages import text_of
 from tests.sweeps import narrow_blocks, small, small_spec
 
-#: Placements and gains; some leave the links or saturate.
+#: Placements and gains; some leave the links or saturate. Programs are those of `test_screen`.
 AXES = {"placement": {"kind": "same"}, "gain": {"from": 0.1, "to": 3.0, "scale": "log"}}
 SWEEP = {
     "method": "random",
     "count": 128,
     "axes": AXES,
     "where": "gain < 2.5",
-    "by": "structural_rms[link=2][station=2]",
-    "metrics": ["structural_rms"],
+    "by": "residual_rms[link=2][station=2]",
+    "metrics": ["residual_rms"],
 }
 SPEC = small_spec(SWEEP)
 KEEP = 12
@@ -346,7 +346,7 @@ KINDS, GAINS = ["sampled", "none"], [0.5, 1.0]
 def of_kinds(out, margin):
     """Designs with and without a sampled loop, and their report."""
     axes = {"control.feedback": KINDS, "control.gain_factor": GAINS}
-    sweep = {"method": "grid", "axes": axes, "metrics": ["structural_rms"], "by": SWEEP["by"]}
+    sweep = {"method": "grid", "axes": axes, "metrics": ["residual_rms"], "by": SWEEP["by"]}
     done = screened(out, small_spec(sweep), margin=margin)
     write_screen_report(out, done)
     return done, text_of((out / "report.html").read_text())
@@ -421,7 +421,7 @@ def test_an_interrupted_screen_goes_on(whole, tmp_path):
     )
     more = screened(out, keep=KEEP + 1)  # chosen among the candidates: nothing runs again
     assert more.selection.kept.row.tolist() == done.tally.row[: KEEP + 1].tolist()
-    by = "structural_rms[link=1][station=2]"
+    by = "residual_rms[link=1][station=2]"
     with pytest.raises(StudyError, match="was begun with another --by"):
         screened(out, by=by)
 
@@ -476,7 +476,7 @@ def test_damaged_tallies_are_refused(whole, tmp_path):
     (tmp_path / TALLY).write_bytes((out / TALLY).read_bytes()[:3000])
     with pytest.raises(StudyError, match=r"remove it and begin again"):
         read_tally(tmp_path, done.screen)
-    other = done.screen._replace(by="structural_rms[link=1][station=2]")
+    other = done.screen._replace(by="residual_rms[link=1][station=2]")
     write_tally(tmp_path, other, done.is_done, done.tally)  # of the same shape, from elsewhere
     with pytest.raises(StudyError, match="not what was written for this screen"):
         read_tally(tmp_path, done.screen)
@@ -506,7 +506,7 @@ def test_what_a_screen_cannot_do_is_refused():
     with pytest.raises(StudyError, match="structural_rms"):
         screen_of(SPEC, by="structral_rms")
     with pytest.raises(StudyError, match="allowed"):
-        screen_of(SPEC, by="structural_rms[link=4]")
+        screen_of(SPEC, by="residual_rms[link=4]")
     for more, message in (
         ({"keep": 0}, "--keep = 0"),
         ({"keep": 100_001}, "--keep = 100001; allowed: 1 to 100000"),
@@ -626,7 +626,6 @@ def test_nothing_is_kept_where_no_design_ends_well(tmp_path, capsys):
 def test_a_report_of_values_that_a_log_scale_lacks(whole, tmp_path):
     """Negative values and zeros have no figures; where the largest are the best, so are shares."""
     _, done = whole
-    done = done._replace(tally=done.tally._replace(sketch=2 * done.tally.sketch))  # enough for 1 %
     sketch = np.zeros_like(done.tally.sketch)
     sketch[:, 0] = done.tally.sketch.sum(axis=1)
     tally = done.tally._replace(value=done.tally.value - 1, sketch=sketch)
@@ -637,6 +636,7 @@ def test_a_report_of_values_that_a_log_scale_lacks(whole, tmp_path):
     assert summary_lines(done._replace(tally=tally))[1].endswith(
         "median of those that are ok: 0 µm or less"
     )
+    done = done._replace(tally=done.tally._replace(sketch=2 * done.tally.sketch))  # enough for 1 %
     largest = done._replace(
         screen=done.screen._replace(by=f"-{done.screen.by}"),
         tally=done.tally._replace(value=done.tally.value[::-1]),
@@ -661,10 +661,10 @@ def test_report_says_what_was_found(whole):
     text = text_of((out / "report.html").read_text())
     assert "128 designs" in text and "actuators saturated" in text and "best.toml" in text
     lines = summary_lines(done)
-    assert lines[1].startswith(f"the best {KEEP} by structural_rms[link=2][station=2]")
-    alone = run_uncontrolled(SPEC.study, is_linear=True).result.metrics.structural_rms[1, 1]
+    assert lines[1].startswith(f"the best {KEEP} by residual_rms[link=2][station=2]")
+    alone = run_uncontrolled(SPEC.study, is_linear=True).result.metrics.residual_rms[1, 1]
     assert done.uncontrolled == pytest.approx(float(alone), rel=1e-9)
-    assert lines[-1].startswith("structural_rms[link=2][station=2] of the baseline without control")
+    assert lines[-1].startswith("residual_rms[link=2][station=2] of the baseline without control")
     value = done.selection.value
     for free, told in (
         (0.9 * value[0], "; no design that is kept is below it"),

@@ -134,7 +134,7 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
 def check_uncontrolled(capsys, spec, folder):
     """The baseline without control is a run of its own; resuming keeps it, older sweeps lack it."""
     data = read_sweep(folder)
-    alone = run_study(data.spec.study.change(control__feedback="none"), has_record=False)
+    alone = run_study(data.spec.study.change(control__links=(False,) * 3), has_loop=False)
     wanted = alone.result.metrics["residual_rms"]
     np.testing.assert_allclose(data.baseline["residual_rms"].data, wanted, rtol=1e-9)
     step = frame_of(*check_run(data.spec.study)).adc_step
@@ -180,7 +180,7 @@ def check_explorer(capsys, out):
         centers = 1e3 * np.asarray(patch_centers(load_design(out, row).study))
         np.testing.assert_allclose(numbers(data["placement"]["centers"])[row], centers, rtol=1e-6)
     replay = data["replays"][0]
-    record = run_study(load_design(out, replay["row"]).study).result.record
+    record = run_study(load_design(out, replay["row"]).study, has_loop=False).result.record
     pose = numbers(replay["motions"][0]["joint"]).mean(axis=1)  # of the platform's three joints
     last = float(numbers(replay["frameTime"])[-1])
     command_end = float(sweep["command_end"][replay["row"]])
