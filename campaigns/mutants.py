@@ -9,10 +9,10 @@ long it takes. `run` draws mutants, spread over the modules in proportion to the
 and runs on each the tests that execute its statement, those about its module and quick ones first,
 until one fails or those within the budget have passed; mutants that the record holds as `waiting`,
 made by hand, are judged first. `check` judges those that were killed once more, each by the test
-that killed it, if that is there, and then by others. WORK holds a copy of the checkout as it was at
-first; begin a new one after a change. The record is a table of one line per mutant; what it holds
-is not computed anew, but for survivors that more tests within the budget could judge. Its column
-`code` finds the line again where lines before it have come or gone.
+that killed it and then, where WORK has a map, by others. WORK holds a copy of the checkout as it
+was at first; begin a new one after a change. The record is a table of one line per mutant; what it
+holds is not computed anew, but for survivors that more tests within the budget could judge. Its
+column `code` finds the line again where lines before it have come or gone.
 """
 
 from __future__ import annotations
@@ -422,14 +422,12 @@ def run(
 def check(work: Path, record: Path, budget: float, jobs: int, of: list[str]) -> None:
     """Judge the killed mutants of the record again, and print those that come back to life."""
     sources, seen, rows = _sources(_base(work), of), _seen(work), read(record)
-    tasks, names = {}, {node for tests in seen.values() for node in tests}
+    tasks = {}
     for mutant, before in _found(rows, sources):
         if before.outcome == "killed":
             lines = statements(sources[mutant.file], mutant)
-            again = plan(seen, mutant, lines, budget)
-            if before.by in names:
-                again.insert(0, {before.by.partition("::")[0]: [before.by]})
-            tasks[mutant] = again
+            killer = {before.by.partition("::")[0]: [before.by]}
+            tasks[mutant] = [killer, *plan(seen, mutant, lines, budget)]
     gone = sum(x.file in sources and v.outcome == "killed" for x, v in rows.items()) - len(tasks)
     alive = 0
     for mutant, ended in _judged(work, tasks, budget, jobs):
