@@ -315,8 +315,7 @@ class BlockFunction:
 
     @cached_property
     def _on_device(self) -> list[Any]:
-        leaves: list[Any] = jax.device_put(self.shared)
-        return leaves
+        return list(jax.device_put(self.shared))
 
     def _movement(
         self, free_axis: int | None, own: Any, shared: Any

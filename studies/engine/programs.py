@@ -84,8 +84,7 @@ class KeptFunction:
 
     def __call__(self, *arguments: Any) -> Any:
         fixed, free = self._split(arguments)
-        is_traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(free))
-        if is_traced:
+        if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(free)):
             return self._inner(*arguments)
         with on_host():
             if not self._is_kept(fixed):
@@ -196,8 +195,7 @@ def _load_or_compile(name: str, lower: Callable[[], Any], modules: Iterable[str]
         return lower().compile()
     entry = ObjectCache("program", name, *environment(*modules))
     content = entry.take()
-    loaded = None if content is None else _load(content)
-    if loaded is not None:
+    if content and (loaded := _load(content)) is not None:
         return loaded
     lowered = lower()
     with without_jax_cache():
@@ -218,15 +216,13 @@ def kept_data(names: list[Any], make: Callable[[], Any], module: str) -> Any:
         make: makes them.
         module: as for `program`.
     """
-    entry = None
-    if names and is_keeping():
-        entry = ObjectCache("data", repr(names), *environment(module, *modules_of(names)))
-    content = entry and entry.take()
-    if content:
+    if not names or not is_keeping():
+        return make()
+    entry = ObjectCache("data", repr(names), *environment(module, *modules_of(names)))
+    if content := entry.take():
         return pickle.loads(content)
     data = make()
-    if entry:
-        entry.keep(pickle.dumps(data))
+    entry.keep(pickle.dumps(data))
     return data
 
 
@@ -249,8 +245,8 @@ def modules_of(names: Any) -> Iterator[str]:
     if callable(names):
         yield names.__module__
     if is_dataclass(names):
-        yield from modules_of([getattr(names, field.name) for field in fields(names)])
-    elif isinstance(names, list | tuple):
+        names = [getattr(names, field.name) for field in fields(names)]
+    if isinstance(names, list | tuple):
         for name in names:
             yield from modules_of(name)
 

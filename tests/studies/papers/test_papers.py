@@ -232,10 +232,10 @@ def test_plucked_runs_confirm_the_energies(unlike):
     np.testing.assert_allclose(found.simulated, found.linear, atol=1e-3)
 
 
-@pytest.fixture(scope="module")
-def free():
+@pytest.fixture(scope="module", params=["3-RRR", pytest.param("3-PRR", marks=pytest.mark.long)])
+def free(request):
     """A few machines of a sample, and their energies."""
-    machines = sample(RRR, 32, seed=1)
+    machines = sample(baselines()[request.param], 32, seed=1)
     return machines, free_energies(machines.study, machines.columns, machines.poses, 1)
 
 
