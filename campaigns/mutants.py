@@ -401,7 +401,7 @@ def run(
 ) -> None:
     """Judge the mutants that the record lacks, and write it after each."""
     sources = _sources(_base(work), of)
-    seen, rows, passed = _seen(work), read(record), Passed(work)
+    seen, rows, passed = _seen(work), relocated(read(record), sources), Passed(work)
     drawn = {_key(x): x for x in islice(sample(sources, seed), count)}
     waiting = {_key(x): x for x, verdict in _found(rows, sources) if verdict.outcome == "waiting"}
     tasks = {}
@@ -467,6 +467,15 @@ def _found(
             found = located(sources[mutant.file], mutant, verdict.code)
             if found is not None:
                 yield found, verdict
+
+
+def relocated(rows: dict[Mutant, Verdict], sources: dict[str, str]) -> dict[Mutant, Verdict]:
+    """A record whose mutants stand where their lines are now; where these are gone, as before."""
+    moved: dict[Mutant, Verdict] = {}
+    for mutant, verdict in rows.items():
+        source = sources.get(mutant.file, "")
+        moved[_key(located(source, mutant, verdict.code) or mutant)] = verdict
+    return moved
 
 
 def located(source: str, mutant: Mutant, code: str) -> Mutant | None:

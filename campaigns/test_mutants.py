@@ -13,12 +13,14 @@ import pytest
 from campaigns.mutants import (
     BY_HAND,
     Mutant,
+    Verdict,
     lines_of_code,
     located,
     mutants,
     mutated,
     plan,
     read,
+    relocated,
     sample,
     statements,
 )
@@ -150,6 +152,10 @@ def test_a_mutant_of_the_record_is_found_where_its_line_is_now():
     by_hand = Mutant("f.py", 2, 8, BY_HAND, "x + 1", "1")
     found = located(later, by_hand, "y = x + 1")
     assert mutated(later, found) == later.replace("x + 1", "1")
+    killed = Verdict("killed", "a test", 1, 1.0, "return y - x + 2")
+    moved = relocated({drawn: killed}, {"f.py": later})
+    assert moved == {drawn._replace(line=6): killed}
+    assert relocated({drawn: killed}, {"f.py": ""}) == {drawn: killed}
 
 
 def test_mutants_in_short(tmp_path):

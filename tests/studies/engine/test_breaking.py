@@ -34,13 +34,6 @@ STUDY = study_of(
 evaluated = jax.jit(closed_loop, static_argnums=0)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def serial():
-    """Matrices are too small for threads, which take turns at waiting for each other."""
-    with threadpool_limits(1, "blas"):
-        yield
-
-
 def rest():
     patches = np.zeros((3, 1))
     return MachineChange(

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from threadpoolctl import threadpool_limits
 
 from jaxmodel import status
 from jaxmodel.laws import n_channels
@@ -67,13 +66,6 @@ PLANTS = {
         "control__gain_factor": 1e-3,
     },
 }
-
-
-@pytest.fixture(scope="module", autouse=True)
-def serial():
-    """Matrices are too small for threads, which take turns at waiting for each other."""
-    with threadpool_limits(1, "blas"):
-        yield
 
 
 def looked_at(study, pose):

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 from scipy.optimize import brentq, minimize, minimize_scalar
-from threadpoolctl import threadpool_limits
 
 from jaxmodel.frequency_response import close_loop, command_gain
 from jaxmodel.linear import linearise, resting
@@ -63,13 +62,6 @@ PLANTS: dict[str, dict[str, Any]] = {
 }
 #: Each of them with a law of its own: every one is a program.
 LAW_OF = dict(zip(PLANTS, ("imsc", "imsc", "lqg"), strict=True))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def serial():
-    """Matrices are too small for threads, which take turns at waiting for each other."""
-    with threadpool_limits(1, "blas"):
-        yield
 
 
 class Loop(NamedTuple):

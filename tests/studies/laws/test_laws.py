@@ -43,7 +43,6 @@ from studies.space.table import build_table
 from studies.study.cases import build_cases, build_structure
 from studies.study.spec import paper_study, parse_study
 from studies.study.window import with_window
-from studies.threads import serial_blas
 from studies.tuning.optimise import _fresh_progress
 from tests.canonical import MACHINE, study_of
 from tests.pages import tables_of
@@ -252,8 +251,7 @@ def test_cases_that_differ_in_motion_alone_share_a_loop():
     np.testing.assert_array_equal(first, [0, 2])
     np.testing.assert_array_equal(own, [0, 0, 1, 1])
     whole = jax.tree.map(lambda x: np.broadcast_to(x, (4, *x.shape[1:])), cases)
-    with serial_blas():
-        found, wanted = judge_cases(structure, cases), judge_loops(structure, whole)
+    found, wanted = judge_cases(structure, cases), judge_loops(structure, whole)
     np.testing.assert_allclose(found.gain_margin, wanted.gain_margin, rtol=1e-6)
     np.testing.assert_allclose(found.least_damping, wanted.least_damping, rtol=1e-6)
 

@@ -46,17 +46,9 @@ from studies.spillover.proofs import (
     volume,
 )
 from studies.spillover.report import document, report, verdict
-from studies.threads import serial_blas
 from tests.pages import text_of
 from tests.proofs import ONE_MOVE as STUDY
 from tests.proofs import many_modes_loop, random_design, spectral_radius
-
-
-@pytest.fixture(scope="module", autouse=True)
-def serial():
-    """Threads of BLAS only wait for each other: its matrices are small."""
-    with serial_blas():
-        yield
 
 
 @pytest.fixture(scope="module")
