@@ -26,7 +26,7 @@ from tests import TOP
 GANTRY = TOP / "tests" / "gantry.py"
 SHORT = """
 [run]
-duration = 0.2
+duration = {duration}
 [link]
 modes = 2
 [control]
@@ -36,7 +36,7 @@ kind = "{kind}"
 [motion]
 waypoints = [[0.0, {y}], [0.0, {end}]]
 [metrics]
-residual_length = 0.05
+residual_length = 0.04
 """
 PLACES = {"five_bar": (0.25, 0.26), "gantry": (0.14, 0.15)}
 #: The five-bar's physics and control are checked in tests/jaxmodel, its commands in campaigns.
@@ -59,21 +59,14 @@ def kind(request, gantry):
     return request.param
 
 
-def written(tmp_path, kind, more=""):
+def written(tmp_path, kind, more="", duration=0.2):
     y, end = PLACES[kind]
     path = tmp_path / "study.toml"
-    path.write_text(SHORT.format(kind=kind, y=y, end=end) + more)
+    path.write_text(SHORT.format(kind=kind, y=y, end=end, duration=duration) + more)
     return str(path)
 
 
-@pytest.mark.long  # in short: a case of a sweep, run again with its report
-def test_one_run_with_its_report(kind, tmp_path, capsys):
-    main(["simulate", written(tmp_path, kind), "--out", str(tmp_path / "run"), "--report"])
-    assert "status: ok" in capsys.readouterr().out
-    assert (tmp_path / "run.html").stat().st_size > 1e4
-
-
-def test_a_sweep_judges_damps_and_draws(kind, tmp_path, capsys):
+def swept(tmp_path, kind):
     more = f"""
 [sweep.axes]
 gain = {{ from = 0.5, to = 1.0, count = 2 }}
@@ -82,17 +75,26 @@ link_subsets = "all"
         [0.15, 0.16] if kind == "five_bar" else [0.0, 0.01]
     }
 """
-    main(["sweep", written(tmp_path, kind, more), "--out", str(tmp_path / "sweep")])
-    data = studies.load(tmp_path / "sweep")
+    main(["sweep", written(tmp_path, kind, more, 0.16), "--out", str(tmp_path / "sweep")])
+    return tmp_path / "sweep"
+
+
+def test_a_sweep_judges_and_damps(kind, tmp_path):
+    data = studies.load(swept(tmp_path, kind))
     rms, margin = (np.asarray(data[x]) for x in ("residual_rms", "gain_margin"))
     assert rms.shape == (2, 4, 2, 2, 3) and np.all(np.asarray(data["status"]) == 0)
     assert np.isfinite(margin).all() and margin.min() > 1.5
     assert list(np.asarray(data["link_subsets"])) == ["none", "1", "2", "1+2"]
     assert rms[:, 3].max() < rms[:, 0].max() / 3
-    main(["explore", str(tmp_path / "sweep")])
+
+
+@pytest.mark.long  # sizes of tables and figures; in short: drawings of its links, below
+def test_a_case_is_drawn_and_run_again_with_its_report(kind, tmp_path, capsys):
+    folder = str(swept(tmp_path, kind))
+    main(["explore", folder])
     assert (tmp_path / "sweep" / "explorer.html").stat().st_size > 1e4
     out = str(tmp_path / "run.h5")
-    main(["replay", str(tmp_path / "sweep"), "--case", "13", "--out", out, "--report"])
+    main(["replay", folder, "--case", "13", "--out", out, "--report"])
     assert (tmp_path / "run.html").stat().st_size > 1e4
     said = capsys.readouterr().out.partition("largest relative difference of a metric: ")[2]
     assert float(said.split()[0]) < 1e-6
@@ -151,7 +153,7 @@ def test_a_pose_has_as_many_numbers_as_the_platform(capsys):
 
 
 def test_modes_of_two_links_are_named(gantry):
-    study = parse_study(tomllib.loads(SHORT.format(kind=gantry, y=0.14, end=0.15)))
+    study = parse_study(tomllib.loads(SHORT.format(kind=gantry, y=0.14, end=0.15, duration=0.2)))
     modes = studies.machine_modes(study)
     assert modes.link_share.shape[1:] == (2, 2)
     assert np.all(np.isfinite(modes.frequency)) and len(modes.frequency) == 6

@@ -5,13 +5,11 @@ import numpy as np
 
 from jaxmodel import status
 from studies.engine.runs import run_study
-from tests.studies.engine.test_batch import short_study
-
-STUDY = short_study(link__modes=2, control__modes=1, shaper__kind="zv")
+from tests.canonical import TINY, study_of
 
 
 def run():
-    return run_study(STUDY, has_record=False, has_loop=False).result
+    return run_study(study_of(TINY), has_record=False, has_loop=False).result
 
 
 def test_float32_runs_and_agrees_with_float64():

@@ -41,8 +41,9 @@ from tests.tunings import GAIN, tuning
 
 #: With noise as in the tests of the batch engine, whose programs these are.
 NOISE = {"electronics": {"adc_noise": 0.002}}
-SPEC = small_spec(MIXED | {"blocks": [MIXED["blocks"][0] | {"count": 8}]}, **NOISE)
-CASES = 144
+SPEC = small_spec(**NOISE)
+HALF = small_spec(MIXED | {"blocks": [MIXED["blocks"][0] | {"count": 2}]}, **NOISE)
+CASES = 72
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -84,7 +85,7 @@ def test_numbers_are_those_of_the_local_run(cluster, local, tmp_path):
     outcome, text = told(cluster, tmp_path / "out")
     assert outcome.n_run == CASES and len(outcome.lost) == 0
     assert_same(arrays(local), arrays(tmp_path / "out"), 1e-12)
-    assert "workers: 2" in text and "144/144 cases" in text
+    assert "workers: 2" in text and "72/72 cases" in text
 
 
 def small_screen():
@@ -139,7 +140,7 @@ def test_from_here_to_the_cluster_and_back(cluster, local, tmp_path):
             yield from islice(super().run(*arguments), 2)
 
     out = tmp_path / "out"
-    run_sweep(small_spec(**NOISE), out, is_quiet=True)  # half of the cases
+    run_sweep(HALF, out, is_quiet=True)
     with pytest.raises(StudyError, match="disappeared"):
         run_sweep(SPEC, out, True, is_quiet=True, runner=Stopped(cluster.client, SPEC, 60.0))
     assert len(list((out / CHUNKS).glob("*.h5"))) == 2
@@ -173,7 +174,7 @@ def test_a_chunk_that_fails_costs_no_worker(cluster, tmp_path):
     cluster.trouble(fail=3)
     before = cluster.pids()
     outcome, text = told(cluster, tmp_path / "out")
-    assert outcome.n_run == CASES - 16 and "OSError: no room" in text
+    assert outcome.n_run == CASES - 8 and "OSError: no room" in text
     assert cluster.pids() == before
 
 
@@ -327,14 +328,14 @@ def test_killed_workers_lose_nothing(cluster, local, tmp_path):
 
 @pytest.mark.long  # in short: a chunk that fails, and workers that are killed
 def test_a_chunk_that_kills_workers_is_left_out_until_resumed(cluster, local, tmp_path):
-    cluster.trouble(kill=70)
+    cluster.trouble(kill=50)
     out = tmp_path / "out"
     outcome, text = told(cluster, out)
-    assert 70 in outcome.lost and len(outcome.lost) == 16
+    assert 50 in outcome.lost and len(outcome.lost) == 16
     assert outcome.n_run == CASES - 16 and not outcome.is_interrupted
     (entry,) = read_manifest(out)["given_up"]
     first, last = map(int, entry["cases"].split("-"))
-    assert first <= 70 <= last == first + 15 and "died" in entry["reason"]
+    assert first <= 50 <= last == first + 15 and "died" in entry["reason"]
     assert f"cases {entry['cases']} are left out" in text
     status = read_sweep(out)["status"]
     np.testing.assert_array_equal(np.flatnonzero(status == NOT_RUN), outcome.lost)
