@@ -3,6 +3,8 @@
 PYTHON ?= python3
 # Small eigenvalue problems are slower on several BLAS threads, much slower beside other processes.
 export OPENBLAS_NUM_THREADS ?= 1
+# Nor without byte code: each command and each child of a test imports a thousand modules.
+export PYTHONDONTWRITEBYTECODE :=
 BIN := .venv/bin
 # A test that kills its process ends the run: pytest-xdist may wait forever with a replacement.
 PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0

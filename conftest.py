@@ -3,7 +3,8 @@
 Tests compile much and run little, so the code generators of XLA and of the kernels leave their
 optimisations out here: the same programs, compiled in a third of the time. Programs are kept in
 `.pytest_cache/programs`, for both workers and for the next run, as commands keep them for users;
-while a test has patched a module of the packages, nothing is kept or taken from there.
+while `monkeypatch` has patched a module of the packages, nothing is kept or taken from there. What
+`unittest.mock` patches must therefore be part of no program.
 """
 
 from __future__ import annotations
