@@ -387,7 +387,7 @@ def test_frequencies_move_with_the_forces_of_the_motion():
 # --- the machine as it was measured ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize("modes", [8, 12])
+@pytest.mark.parametrize("modes", [8, pytest.param(12, marks=pytest.mark.long)])
 def test_the_measured_machine_has_a_margin(modes):
     """Patches and joint inertia in the plant, measured frequencies in the controller."""
     study = load_study(SPECS / "measured.toml").change(link__modes=modes)

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import studies
-from jaxmodel.bases import find_bases
 from jaxmodel.case import Structure
 from jaxmodel.control import pole_placement
 from jaxmodel.simulate import simulate
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import parse_study
 from tests.documents import blocks, page
+from tests.jaxmodel.kept import bases_of
 from tests.studies.engine.test_batch import short_study
 from tests.sweeps import BASE
 
@@ -33,7 +33,7 @@ def objective():
     # what nobody asks for must not cost a compilation
     structure = build_structure(study)._replace(metrics=("residual_rms",), n_frequencies=1)
     case = as_arrays(build_case(study))
-    omega = find_bases(structure, case).believed_omega[:, 0]
+    omega = np.asarray(bases_of(structure, case).believed_omega[:, 0])
 
     def run(x):
         gain, ratio, decay, frequency, center = jnp.split(x, 5)

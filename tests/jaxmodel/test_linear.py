@@ -157,6 +157,7 @@ def test_flatten_and_unflatten_are_inverse():
         np.testing.assert_array_equal(before, after)
 
 
+@pytest.mark.long  # in short: fast moves, in test_axial
 def test_released_link_moves_like_the_finite_element_link():
     time, given = tables.free_response()
     study = UNDAMPED.change(

@@ -42,7 +42,7 @@ def energy_and_work(name, legs=Cranks):
     """Energy gained and work done by motors, friction, damping and actuators [J], (N,) each."""
     structure, loop, start = at_home(name, 3, drive__viscous_friction=VISCOUS)
     plant = loop.plant._replace(legs=legs(*loop.plant.legs))
-    loop, step = loop._replace(plant=plant), 1e-5
+    loop, step = loop._replace(plant=plant), 2e-5
     time = step * np.arange(round(1.2 * MOVE_TIME / step) + 1)
     voltages = np.full((len(time) - 1, structure.n_links, structure.n_patches), VOLTS)
     after = run("etdrk4", structure, loop, step, 1, voltages, start)

@@ -126,6 +126,7 @@ def onset_is_at_the_margin(study: Study) -> None:
     assert is_growing(_run(structure, case, (1 + WITHIN) * factor)), margin
 
 
+@pytest.mark.long  # in short: runs are those of the matrices, in test_delay
 def test_runs_grow_beyond_the_printed_margin():
     """Of a law with a model of the plant, at the paper's square's first pose."""
     onset_is_at_the_margin(study_of("observer", DESIGNS["observer"][0]))

@@ -16,6 +16,7 @@ from studies.export.in_the_loop import replay
 from studies.single.plant import controller_of, plant_of, write_system
 from studies.study.spec import parse_study
 from studies.study.template import study_template
+from tests.jaxmodel.kept import without_run
 from tests.jaxmodel.test_state_space import PERIOD, SHORT, study_with, thirty  # noqa: F401
 from tests.studies.test_cli import refused, run
 
@@ -36,8 +37,7 @@ def closed(plant, matrices):
 def test_a_controller_around_it_has_the_poles_of_the_loop(thirty, electronics):  # noqa: F811
     matrices, path, _ = thirty
     study = study_with(path, electronics=electronics)
-    structure, case = check_run(study)
-    report = loop_report(structure._replace(n_steps=1), case, np.array(HOME), 1)
+    report = loop_report(*without_run(study), np.array(HOME), 1)
     # judged with twelve modes a link: so is this plant, once it has them
     plant = plant_of(study.change(link__modes=12))
     poles = np.linalg.eigvals(closed(plant, matrices))

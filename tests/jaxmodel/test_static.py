@@ -17,8 +17,6 @@ from jaxmodel.piezo import actuator_constant, sensor_constant
 from jaxmodel.prepare import prepare
 from studies.engine.margins import judge_loops
 from studies.engine.programs import kept_jit
-from studies.engine.run_data import chord_deflection
-from studies.engine.runs import Run, _simulate
 from studies.engine.stability import loop_report
 from studies.fitting.bench import Bench, response
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure, case_of
@@ -176,8 +174,8 @@ FINITE_ELEMENTS = {
 @pytest.mark.parametrize(
     ("basis", "n_modes", "within"),
     [
-        ("pinned_pinned", 3, 0.06),
         # in short: of loops in test_sampled_loop, and of a batch below
+        pytest.param("pinned_pinned", 3, 0.06, marks=pytest.mark.long),
         pytest.param("pinned_pinned", 8, 0.0225, marks=pytest.mark.long),
         pytest.param("pinned_pinned", 12, 0.01, marks=pytest.mark.long),
         ("loaded", 12, 0.01),
@@ -191,14 +189,9 @@ def test_margins_are_those_of_finite_elements(basis, n_modes, within):
     np.testing.assert_allclose(found.damping_ratio[0], damping, rtol=min(within, 0.01))
 
 
+@pytest.mark.long  # in short: the table of test_sampled_loop
 @pytest.mark.parametrize(
-    ("n_modes", "margin", "damping"),
-    [
-        (3, 5.56, 0.307),
-        # in short: the table of test_sampled_loop
-        pytest.param(8, 4.44, 0.248, marks=pytest.mark.long),
-        pytest.param(12, 2.68, 0.184, marks=pytest.mark.long),
-    ],
+    ("n_modes", "margin", "damping"), [(3, 5.56, 0.307), (8, 4.44, 0.248), (12, 2.68, 0.184)]
 )
 def test_truncated_plants_have_another_loop(n_modes, margin, damping):
     """The paper's model, for comparison: modal sums alone, whose margins do not converge."""
@@ -242,32 +235,6 @@ def test_deflections_at_the_stations_have_it():
     np.testing.assert_allclose(jax.jit(deflection)(loop, q, volts), wanted, rtol=2e-4)
     alone = np.einsum("isr,ir->is", loop.deflection_at, q)
     assert np.abs(alone / wanted - 1).max() > 5e-3
-
-
-def test_mid_span_of_a_run_is_the_station_there():
-    """Reported afterwards, from modes and commands, behind slow amplifiers."""
-    study = paper_study().change(
-        link__modes=2,
-        control__modes=2,
-        control__ratios=((1.5, 2.0),) * 3,
-        electronics__amplifier_hz=300.0,
-        run__duration=0.06,
-        motion__waypoints=paper_study().motion.waypoints[:2],
-        motion__move_time=0.02,
-        shaper__kind="none",
-        metrics__stations=(0.5,),
-        metrics__residual_length=0.01,
-        metrics__residual_delay=0.0,
-    )
-    structure, case = build_structure(study), build_case(study)
-    few = structure._replace(metrics=("residual_rms",), n_frequencies=1)
-    result = jax.tree.map(np.asarray, _simulate(few, case, True))
-    run = Run(study, structure, case, result, int(result.status))
-    station = np.asarray(run.result.record.chord_deflection_stations)[:, :, 0]
-    size = np.abs(station).max()
-    np.testing.assert_allclose(chord_deflection(run), station, rtol=0, atol=1e-12 * size)
-    per_volt = np.asarray(run.result.record.actuator_voltage)[:, :, 1]
-    assert np.abs(per_volt).max() > 1  # so that there is something to miss
 
 
 def test_stations_are_fractions_and_measured_places_metres():

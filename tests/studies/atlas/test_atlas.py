@@ -13,36 +13,27 @@ from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
 
-from studies.atlas import attribution, claims, figures, findings, run, subsets, workspace
+from studies.atlas import attribution, claims, figures, findings, platform, run, subsets, workspace
 from studies.atlas.platform import LINK_SETS, platform_error, responses
 from studies.engine.modes import machine_modes
 from studies.engine.results import read_sweep
 from studies.engine.runs import run_study
 from studies.errors import StudyError
-from studies.study.spec import paper_study
+from tests.canonical import HOME, MACHINE, TINY, study_of
 from tests.pages import Page, text_of
 from tests.studies.test_cli import refused
 from tests.studies.test_cli import run as command
+from tests.sweeps import narrow_blocks
 
-SETTINGS = ((0.05, "ei"), (0.03, "none"))
+#: Moves that fit into the run.
+PATH = (tuple(HOME), (0.0, 0.001, HOME[2]))
+SETTINGS = ((0.02, "ei"), (0.015, "none"))
 
 
 def small_study(**fields):
-    """One move, one controlled mode."""
-    home = paper_study().motion.waypoints[0]
-    return (
-        paper_study()
-        .change(
-            link__modes=2,
-            control__modes=1,
-            control__ratio_source="own_run",
-            run__duration=0.18,
-            metrics__residual_delay=0.0,
-            metrics__residual_length=0.06,
-            motion__move_time=0.05,
-            motion__waypoints=(home, (0.0, 0.01, home[2])),
-        )
-        .change(**fields)
+    """One move; its programs are those of `MACHINE`."""
+    return study_of(MACHINE, control__ratio_source="own_run").change(
+        **{"motion__waypoints": PATH} | fields
     )
 
 
@@ -65,13 +56,15 @@ def atlas(tmp_path_factory):
     # what is replaced is part of no program: they are kept
     console = Console(file=io.StringIO())
     with (
+        narrow_blocks(32),
         mock.patch.multiple(
             run,
             atlas_sweep=partial(subsets.atlas_sweep, settings=SETTINGS),
             evaluate_atlas=look,
-            MATTERS=-1.0,  # every setting's subsets of modes
+            beyond_first=lambda *_: np.array([0.0, 1.0]),  # subsets of modes in the second one
             FIGURES={name: drawn(name) for name in figures.FIGURES},
         ),
+        mock.patch.object(platform, "SETTINGS", SETTINGS),
         mock.patch.object(figures, "CLIP", (-0.002, 0.002, 1e-3)),
         mock.patch.multiple(
             findings,
@@ -128,8 +121,9 @@ def test_shares_of_the_atlas_sum_to_what_is_removed(atlas):
     folder, found = atlas
     game = found.links.removed()
     with xarray.open_dataset(folder / run.DATA) as data:
-        for share in (data.shapley_share.sum("link"), data.mode_shapley_share.sum("player")):
-            np.testing.assert_allclose(share.values, game[..., -1], rtol=1e-9, atol=1e-12)
+        modes = data.mode_shapley_share.sum("player")
+        for share, whole in ((data.shapley_share.sum("link"), game), (modes, game[1:])):
+            np.testing.assert_allclose(share.values, whole[..., -1], rtol=1e-9, atol=1e-12)
         assert np.abs(game[..., -1]).max() > 0.5
         assert np.all(np.isfinite(data.interaction))
         np.testing.assert_array_equal(data.removed.sel(links="1+3"), game[..., 0b101])
@@ -139,7 +133,7 @@ def test_shares_of_the_atlas_sum_to_what_is_removed(atlas):
 def test_subsets_come_in_the_order_of_people():
     names = [subsets.subset_label(k, 1) for k in subsets.in_order(3)]
     assert names == ["none", "1.1", "2.1", "3.1", "1.1+2.1", "1.1+3.1", "2.1+3.1", "1.1+2.1+3.1"]
-    two = small_study(control__modes=2, control__ratio_source="given")
+    two = study_of(TINY)
     spec = subsets.atlas_sweep(two, SETTINGS[:1])
     masks = np.array(spec.data["sweep"]["axes"]["control.mode_mask"])
     assert masks.shape == (15, 3, 2)  # no link once
@@ -159,15 +153,12 @@ def test_modes_matter_where_their_control_changes_something():
 
 
 def test_a_case_of_the_atlas_is_the_run_of_its_study(atlas):
-    seen = atlas[1].links
-    where = seen.setting.index((0.03, "none"))
-    moved = small_study(
-        motion__move_time=0.03, shaper__kind="none", control__links=(True, False, True)
-    )
+    moved = small_study(motion__move_time=0.015, control__links=(True, False, True))
     metrics = run_study(moved, has_record=False, has_loop=False).result.metrics
-    for found in (seen, atlas[1].subsets):  # one mode a link: its subsets are those of links
-        np.testing.assert_allclose(found.station[where, 0b101], metrics.residual_rms, rtol=1e-6)
-        np.testing.assert_allclose(found.pose[where, 0b101], metrics.pose_error_rms, rtol=1e-6)
+    for found, k in ((atlas[1].links, 0b101), (atlas[1].subsets, 0b111000111)):
+        assert found.setting[-1] == SETTINGS[1]
+        np.testing.assert_allclose(found.station[-1, k], metrics.residual_rms, rtol=1e-6)
+        np.testing.assert_allclose(found.pose[-1, k], metrics.pose_error_rms, rtol=1e-6)
 
 
 def test_atlas_writes_what_its_report_shows(atlas):
@@ -201,24 +192,20 @@ def test_vibration_after_a_command_that_ends_the_run(atlas):
 
 def test_vibration_and_drive_add_up_to_the_error_of_a_run(atlas):
     runs = atlas[1].platform
-    moved = small_study(shaper__kind="none", control__links=LINK_SETS[1])
-    record = run_study(moved, has_loop=False).result.record
-    total = runs.drive[1] + runs.vibration[1, 1]
-    total = total[: len(record.time)]
-    size = np.abs(record.pose_error).max(axis=0)
-    assert np.all(np.abs(total - record.pose_error).max(axis=0) <= 1e-6 * size)
-    assert np.all(np.abs(runs.vibration[1, 1]).max(axis=0) > 1e-6 * size)
+    moved = small_study(motion__move_time=0.015, control__links=LINK_SETS[1])
+    wanted = run_study(moved, has_record=False, has_loop=False).result.metrics.pose_error_rms
+    np.testing.assert_allclose(runs.rms(runs.drive[:, None] + runs.vibration)[1, 1], wanted, 1e-6)
+    assert np.all(runs.rms(runs.vibration)[1, 1] > 1e-6 * wanted)
 
 
 def test_stiff_links_leave_drive_error_alone(atlas):
-    """Quasi-static bending falls as 1/E."""
-    stiff = small_study(link__youngs_modulus=4 * small_study().link.youngs_modulus)
-    assert 2.5 < _vibration(atlas[1].platform) / _vibration(platform_error(stiff)) < 6
-
-
-def _vibration(runs):
-    moving = runs.time < runs.command_end[0]
-    return np.sqrt(np.mean(runs.vibration[0, 0, moving, 1] ** 2))
+    """Without a shaper, which follows the links' frequencies."""
+    runs = atlas[1].platform
+    modulus = small_study().link.youngs_modulus
+    with mock.patch.object(platform, "SETTINGS", SETTINGS):
+        stiff = platform_error(small_study(link__youngs_modulus=4 * modulus))
+    np.testing.assert_allclose(stiff.drive[1], runs.drive[1], rtol=1e-9, atol=1e-15)
+    assert 2 * stiff.rms(stiff.vibration)[1, 0, 1] < runs.rms(runs.vibration)[1, 0, 1]
 
 
 def test_static_response_is_the_drive_s_stiffness():
@@ -252,7 +239,7 @@ def test_map_at_home_is_that_of_the_machine(atlas):
 
 def test_a_pose_out_of_reach_is_refused():
     with pytest.raises(StudyError, match="pose = .*gamma is inside"):
-        workspace.natural_modes_at(paper_study(), [(0.2, 0.0, 0.5)])
+        workspace.natural_modes_at(small_study(), [(0.2, 0.0, 0.5)])
 
 
 def made_up(link, platform):

@@ -23,22 +23,28 @@ def work():
         return peers.make_work(is_short=True)
 
 
-def check_agreement(rms, work):
-    own = Executor(work.structure, work.layout, kind="kernel").start(work.cases).wait()
-    wanted = own.metrics.residual_rms[: len(rms)]
+@pytest.fixture(scope="module")
+def own(work):
+    """Residual vibration by the kernel."""
+    run = Executor(work.structure, work.layout, kind="kernel").start(work.cases)
+    return run.wait().metrics.residual_rms
+
+
+def check_agreement(rms, own):
+    wanted = own[: len(rms)]
     assert wanted.min() > 1e-9
     np.testing.assert_allclose(rms, wanted, atol=2e-6 * wanted.max())
 
 
-def test_hand_written_c_agrees(work):
+def test_hand_written_c_agrees(work, own):
     compiler = shutil.which("gcc") or shutil.which("clang")
     if not compiler:
         pytest.skip("neither gcc nor clang is installed")
-    check_agreement(peers.by_c(work, compiler, 4)(), work)
+    check_agreement(peers.by_c(work, compiler, 4)(), own)
 
 
-def test_adaptive_steps_agree(work):
-    check_agreement(peers.by_scipy(work)(), work)
+def test_adaptive_steps_agree(work, own):
+    check_agreement(peers.by_scipy(work)(), own)
 
 
 @pytest.mark.long

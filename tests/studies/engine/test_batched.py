@@ -11,7 +11,6 @@ import pytest
 from jax.sharding import AxisType, PartitionSpec
 
 from jaxmodel import status
-from studies.engine import function
 from studies.engine.batched import batched
 from studies.engine.runs import run_study
 from studies.errors import StudyError
@@ -70,7 +69,9 @@ def results(rounded, wide):
 def test_it_equals_the_scan(results, wide, monkeypatch):
     """Within 1e-9, status by status; ten cases do not fill the vectors."""
     monkeypatch.setattr(bridge, "is_available", lambda: False)
-    wanted = jax.tree.map(np.asarray, jax.jit(batched(STUDY, (*NAMES, *MORE)))(wide))
+    traced = jax.jit(batched(STUDY, (*NAMES, *MORE))).trace(wide)
+    assert "ffi_call" not in (text := str(traced.jaxpr)) and "scan" in text
+    wanted = jax.tree.map(np.asarray, traced.lower().compile()(wide))
     np.testing.assert_array_equal(results.status, wanted.status)
     assert set(results.status) == {status.OK, status.DIVERGED}
     good = results.status == status.OK
@@ -80,21 +81,25 @@ def test_it_equals_the_scan(results, wide, monkeypatch):
         assert np.isnan(x[~good]).all()
 
 
-def test_it_runs_inside_other_programs(rounded, wide):
+def test_it_runs_inside_other_programs(rounded, results, wide):
+    """Made by two threads at once: XLA takes the name of a kernel once."""
     half = np.concatenate([wide[4:8], wide[6:10]])
     whole = np.concatenate([half, half])
 
     def rms(x):
         return rounded(x).metrics.residual_rms
 
-    alone = np.concatenate([jax.jit(rms)(half)] * 2)
+    alone = results.metrics.residual_rms
+    alone = np.concatenate([alone[4:8], alone[6:10]] * 2)
     assert alone.min() > 0
-    mapped = jax.jit(lambda x: jax.lax.map(rms, x))(whole.reshape(2, 8, -1))
-    np.testing.assert_allclose(mapped.reshape(alone.shape), alone, rtol=1e-12)
     mesh = jax.make_mesh((2,), ("cases",), axis_types=(AxisType.Auto,))
     spec = PartitionSpec("cases")
     shared = jax.shard_map(rms, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
-    np.testing.assert_allclose(jax.jit(shared)(whole), alone, rtol=1e-12)
+    with ThreadPoolExecutor(2) as pool:
+        mapped = pool.submit(jax.jit(lambda x: jax.lax.map(rms, x)), whole.reshape(2, 8, -1))
+        parted = pool.submit(jax.jit(shared), whole)
+    np.testing.assert_allclose(mapped.result().reshape(alone.shape), alone, rtol=1e-12)
+    np.testing.assert_allclose(parted.result(), alone, rtol=1e-12)
 
 
 def sum_of_squares(function, x):
@@ -143,12 +148,6 @@ def test_jacobians_and_rounded_loops(smooth, parameters, monkeypatch):
     wanted = jax.grad(lambda x: scan(x).metrics.residual_rms.sum())(few)
     size = np.abs(wanted).max(axis=0)
     assert (np.abs(turned - wanted) <= 1e-9 * size).all() and (size[:2] > 0).all()
-
-
-def test_without_kernels_it_is_the_scan(monkeypatch):
-    monkeypatch.setattr(function, "stepper", lambda structure: "scan")
-    traced = jax.make_jaxpr(batched(STUDY, NAMES))(np.ones((2, 3)))
-    assert "ffi_call" not in str(traced) and "scan" in str(traced)
 
 
 def test_another_version_of_the_interface_is_left_alone(monkeypatch):
@@ -209,14 +208,6 @@ def test_a_wrong_study_or_names_are_named():
         batched("paper", NAMES)
     with pytest.raises(StudyError, match="names: 'drive.kp'; expected names"):
         batched(STUDY, "drive.kp")
-
-
-def test_first_calls_from_several_threads(rounded, wide):
-    """XLA takes the name of a kernel once."""
-    with ThreadPoolExecutor(2) as pool:
-        calls = [jax.jit(lambda x: rounded(x).status) for _ in range(2)]
-        one = list(pool.map(lambda call: np.asarray(call(wide[:5])), calls))
-    assert all((x == one[0]).all() for x in one)
 
 
 def test_a_number_that_is_none_spoils_no_derivative(differentiated, parameters):

@@ -31,6 +31,7 @@ from studies.study.cases import as_arrays, build_case, build_cases, build_struct
 from studies.study.margin import HIGHEST, LOWEST
 from studies.sweeps.show import ranked_cases
 from tests.canonical import MACHINE, study_of
+from tests.jaxmodel.test_notch import NOTCHES
 from tests.loops import Loops, exact_margins, matrices, random_loops
 from tests.sweeps import FAST_MOVE
 
@@ -55,8 +56,10 @@ PLANTS = {
     "strain rate feedback": {"control__law": "srf", "control__gain_factor": 1e-3},
     "friction": {"drive__coulomb_friction": 0.5},
     "one mode": {"control__modes": 1},
-    # all terms of the others are in these two
+    # all terms of the others are in these two, the first one of them with a delay and notch filters
     "free ends under load, electronics, strain rate feedback": {
+        **{f"control__{x}": y for x, y in NOTCHES.items()},
+        "electronics__delay": 2.625,
         "load__wrench": (3.0, -2.0, 0.1),
         "link__basis": "pinned_free",
         "link__damping_ratio": (1e-4,),
@@ -298,6 +301,7 @@ def test_idle_links_cost_nothing_and_change_nothing():
     )
 
 
+@pytest.mark.long  # in short: steps over lanes by the scan, in test_equations
 def test_scan_gives_the_same_as_kernels(monkeypatch):
     loops = random_loops(24, 5)
     is_single = np.sum(loops.cases.control.link_mask, axis=1) == 1  # the smallest programs

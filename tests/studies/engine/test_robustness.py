@@ -60,8 +60,12 @@ PLANTS: dict[str, dict[str, Any]] = {
     },
     "no reaction of bending": {"run__model": "ked"},
 }
-#: Each of them with a law of its own: every one is a program.
+#: Each of them with a law of its own: every one is a program, and all terms are in the first two.
 LAW_OF = dict(zip(PLANTS, ("imsc", "imsc", "lqg"), strict=True))
+CASES = [
+    pytest.param(*x, marks=[pytest.mark.long] if "lqg" in x else [], id=x[0])
+    for x in LAW_OF.items()
+]
 
 
 class Loop(NamedTuple):
@@ -117,16 +121,16 @@ def exact_gain(loop: Loop, omega: float) -> np.ndarray:
     return -m.feedback[at] @ states
 
 
-@pytest.mark.parametrize("name", PLANTS)
-def test_the_response_is_that_of_the_matrices(name):
-    loop = loop_of(name, LAW_OF[name])
+@pytest.mark.parametrize(("name", "law"), CASES)
+def test_the_response_is_that_of_the_matrices(name, law):
+    loop = loop_of(name, law)
     for hertz in (3.0, 114.4, 457.0, 2000.0, 4400.0):
         omega = 2 * np.pi * hertz
         found, wanted = _gain(loop.response, omega, 0.0), exact_gain(loop, omega)
         np.testing.assert_allclose(found, wanted, atol=1e-6 * np.abs(wanted).max())
 
 
-@pytest.mark.parametrize(("name", "law"), [*LAW_OF.items(), ("plain", "lqr")])
+@pytest.mark.parametrize(("name", "law"), [*CASES, ("plain", "lqr")])
 def test_the_search_uses_the_same_response(name, law):
     """In NumPy, also with a further delay; 1e-4 with few images of the spectrum."""
     loop = loop_of(name, law)
@@ -314,7 +318,9 @@ def _late(structure, case, delay):
     return delayed_loop(structure, case, case.path.waypoints[0], law, delay)
 
 
-@pytest.mark.parametrize("kind", ["pd", "super_twisting"])
+@pytest.mark.parametrize(  # of a drive by analogue electronics: in short above
+    "kind", [pytest.param("pd", marks=pytest.mark.long), "super_twisting"]
+)
 def test_poles_of_a_later_loop_are_those_of_its_delay(kind):
     """A plant on a sampled drive moves freely, which has no eigenvectors of its own."""
     study = STUDY.change(drive__kind=kind)

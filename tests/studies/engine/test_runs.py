@@ -127,9 +127,10 @@ def test_a_sound_run_is_ok_and_says_how_far_it_stays_from_singular_poses():
             {"load__mass": 2.5, "motion__move_time": 0.03} | UNCONTROLLED,
             status.OVERLOADED,
         ),
-        (  # a model that cannot buckle says so, too
+        pytest.param(  # a model that cannot buckle says so, too
             {"load__wrench": (200.0, 0.0, 0.0), "link__shortening": False} | UNCONTROLLED,
             status.OVERLOADED,
+            marks=pytest.mark.long,
         ),
         ({"metrics__singularity_margin": 0.5}, status.NEAR_SINGULAR),
     ],

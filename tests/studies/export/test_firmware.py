@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -30,8 +31,7 @@ from tests.studies.test_cli import refused, run
 
 @pytest.fixture(scope="module", autouse=True)
 def short_sequences():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sequences, "LENGTH", 300)
+    with mock.patch.object(sequences, "LENGTH", 300):  # is part of no program: they are kept
         yield
 
 

@@ -2,11 +2,14 @@
 
 import copy
 import re
+from functools import partial
+from unittest import mock
 
 import numpy as np
 import pytest
 
-from studies.fitting.diagnosis import BETTER, _of_data, diagnose
+from studies.fitting import diagnosis
+from studies.fitting.diagnosis import BETTER, _of_data, _of_links, diagnose
 from studies.fitting.estimate import fit
 from studies.fitting.faults import fault_of
 from studies.fitting.report import sentences
@@ -92,10 +95,10 @@ def spoilt_fit(problem, spoilt):
     return problem, descend(problem, problem.free.places(), 40).u
 
 
-def diagnosed(measured, spoilt):
-    """All remedies of such a fit."""
-    spec, problem = measured
-    return diagnose(spec, *spoilt_fit(problem, spoilt))
+#: Without what has large programs of its own: more modes, fields of all sections at once.
+few_programs = partial(
+    mock.patch.multiple, diagnosis, _of_modes=lambda *_: [], SECTIONS=("machine", "load")
+)
 
 
 def scaled(one, factor):
@@ -159,7 +162,7 @@ def test_exchanged_channels_are_named(measured):
             one.measured, one.sigma = exact * noise, np.hypot(NOISE * np.abs(exact), 1e-5)
         return one
 
-    best = diagnosed(measured, swapped)[0]
+    (best,) = _of_data(*spoilt_fit(measured[1], swapped))
     assert best.text == "response 2: its sensor is 2.2"
 
 
@@ -221,31 +224,42 @@ def test_faults_of_traces_are_named(folder, bench, spoil, said):
 
 
 def of_decays(folder, bench, study, **entry):
-    """The best remedy of a fit that does not explain a record of decays."""
+    """A fit that does not explain a record of decays: specification, problem and where it ends."""
     write_decays(folder, bench, np.array([1.0, 0.012]))
     entry = DECAY | {"name": "decay", "segment_s": 0.5} | entry
     spec = spec_of(folder, entry, free=FREE_OF_UNEQUAL, study=study)
     problem = posed(spec)
     u = followed(problem)
     assert not describe_fit(problem, u).is_explained
-    return diagnose(spec, problem, u)[0].text
+    return spec, problem, u
 
 
 def test_exchanged_channels_of_a_record_are_named(folder, bench):
     """The cables of two sensors: shapes and frequencies no longer belong together."""
     exchanged = [SENSORS[1], SENSORS[0], SENSORS[2]]
-    text = of_decays(folder, bench, UNEQUAL, values=exchanged)
-    assert text == "decay: sensor 1.1 and sensor 2.1 are exchanged"
+    (best,) = _of_data(*of_decays(folder, bench, UNEQUAL, values=exchanged)[1:])
+    assert best.text == "decay: sensor 1.1 and sensor 2.1 are exchanged"
+    assert best.after * BETTER < best.before
 
 
 def test_links_that_differ_are_named(folder, bench):
     """Three unequal links, fitted as equal ones."""
     equal = {"link": UNEQUAL["link"] | {"youngs_modulus": [70e9] * 3}}
-    assert "the links differ in link.stiffness_factor" in of_decays(folder, bench, equal)
+    (best,) = _of_links(*of_decays(folder, bench, equal))
+    assert "the links differ in link.stiffness_factor" in best.text
+    assert best.after * BETTER < best.before
 
 
 def test_good_data_have_no_remedy(measured):
-    assert diagnosed(measured, lambda _, one: one) == ()
+    spec, problem = measured
+    with few_programs():
+        assert diagnose(spec, *spoilt_fit(problem, lambda _, one: one)) == ()
+
+
+@pytest.mark.long  # in short: without large programs
+def test_good_data_have_no_remedy_of_any_kind(measured):
+    spec, problem = measured
+    assert diagnose(spec, *spoilt_fit(problem, lambda _, one: one)) == ()
 
 
 def test_the_fixed_field_that_is_wrong_is_named(folder, measured):
@@ -255,7 +269,8 @@ def test_the_fixed_field_that_is_wrong_is_named(folder, measured):
         write(folder, f"r{k}.csv", frequency_hz=LINES, **parts)
     study = UNEQUAL | {"machine": {"platform_mass": 0.14}}
     options = {"starts": 2, "refine": 1, "profile": False}
-    found = fit(spec_of(folder, *entries(), free=FREE_OF_UNEQUAL, study=study, **options))
+    with few_programs():
+        found = fit(spec_of(folder, *entries(), free=FREE_OF_UNEQUAL, study=study, **options))
     assert not found.answer.is_explained
     (text,) = (x.text for x in found.remedies if x.text.startswith("machine.platform_mass"))
     value = float(re.fullmatch(".*, which is fixed at 0.14, is (.*) kg", text)[1])

@@ -4,6 +4,7 @@ import io
 import json
 import re
 import time
+from unittest import mock
 
 import h5py
 import jax
@@ -15,7 +16,9 @@ import scipy
 from rich.console import Console
 from scipy.stats import chi2
 
+from jaxmodel import status
 from studies.errors import StudyError
+from studies.fitting import bench as benches
 from studies.fitting.estimate import estimate, fit
 from studies.fitting.kinds.contract import Line
 from studies.fitting.kinds.modes import TWO_PI, pair_modes
@@ -84,9 +87,10 @@ ENTRIES = {
     "spectrum": SPECTRUM,
     "trace": TRACE,
     "settling": SETTLING,
-    "figures": FIGURES,
-    "reduction": REDUCTION,
 }
+#: Of runs with one mode, whose kernel is small.
+OF_RUNS = {"figures": FIGURES, "reduction": REDUCTION}
+ONE = {name: SHORT[name] | {"modes": 1} for name in ("link", "control")}
 
 
 @pytest.fixture(scope="module")
@@ -100,6 +104,8 @@ def every_kind(folder, bench):
     """Values and measurements by kind; signals over time are of runs in closed form."""
     _, measurements, values = made(spec_of(folder, *ENTRIES.values()), bench)
     found = dict(zip(ENTRIES, measurements, strict=True))
+    _, measurements, _ = made(spec_of(folder, *OF_RUNS.values(), study=ONE), bench)
+    found |= zip(OF_RUNS, measurements, strict=True)
     ring(found["trace"])
     ring(found["settling"])
     return values, found
@@ -111,7 +117,7 @@ def ring(one):
         one._band = one._band._replace(without=one._motion)
 
 
-@pytest.mark.parametrize("kind", ENTRIES)
+@pytest.mark.parametrize("kind", [*ENTRIES, *OF_RUNS])
 def test_derivatives_of_every_kind(bench, every_kind, kind):
     """Against central differences of fourth order, each column within 1e-5 of its size."""
     values, measurements = every_kind
@@ -645,12 +651,13 @@ def test_folders_that_cannot_be_are_refused_before_the_work(tmp_path):
 
 def test_poses_out_of_reach_are_no_data(folder, bench):
     """Kinematics are finite everywhere; a machine that does not reach a pose is not fitted."""
-    free = {"link.length": {"from": 0.15, "to": 0.25}}
-    pose = (0.0, 0.0, 0.5236)
-    found = make_bench(spec_of(folder, RESPONSE | {"pose": list(pose)}, free=free))
-    assert [list(x) for x in found.many(np.array([[0.17], [0.2]]))] == [[], [pose]]
     problem = posed(spec_of(folder, RESPONSE), bench)
     (one,), u = problem.measurements, problem.free.places()
+    batch, codes = benches._plant_batch, np.full(benches.BATCH, status.OK)
+    codes[0] = status.OUT_OF_REACH
+    with mock.patch.object(benches, "_plant_batch", lambda *x: (batch(*x)[0], codes)):
+        found = bench.many(problem.free.values(np.stack([u, u])))
+    assert [list(x) for x in found] == [[], list(bench.poses)]
     assert np.all(np.isfinite(problem.costs(u[None])))
     one._pose = 0.5, 0.0, 0.0
     for has_slopes in (True, False):

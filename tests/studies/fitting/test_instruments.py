@@ -140,10 +140,11 @@ def test_friction_from_the_motor_s_force_of_a_move(tmp_path):
         "drive.coulomb_friction": {"from": 0.0, "to": 3.0},
         "drive.viscous_friction": {"from": 0.0, "to": 30.0},
     }
-    time = np.arange(0.0, 0.05, 2e-4)
+    time = np.arange(0.0, 0.03, 1e-4)
     entry = TRACE | {"output": "motor 1", "sigma": 0.05}
     write(tmp_path, "trace.csv", time=time, value=np.ones(len(time)))
     study = {"drive": {"friction_speed": 0.01}, "shaper": {"kind": "none"}}
+    study |= {"run": {"duration": 0.032}, "motion": SHORT["motion"] | {"move_time": 0.02}}
     study["control"] = {"modes": 2, "feedback": "none"}
     problem = posed(spec_of(tmp_path, entry, free=free, study=study))
     (one,), truth = problem.measurements, np.array([0.8, 9.0])

@@ -135,6 +135,7 @@ gain = [0.2, 0.4]
 """
 
 
+@pytest.mark.long  # in short: executors are named, below
 def test_a_sweep_runs_by_the_scan_and_says_so(capsys, tmp_path, no_structure):
     path = tmp_path / "small.toml"
     path.write_text(text_of(RELEASED) + SWEEP)

@@ -89,8 +89,12 @@ STIFFNESSES = {"method": "random", "count": 32, "axes": {"drive.kp": {"from": 1e
 @pytest.mark.parametrize(
     ("sweep", "sections"),
     [
-        (ALL_SORTS, {"metrics": {"residual_delay": 0.0, "residual_length": 0.004}}),
-        # in short: every operation is translated, below
+        # in short: every operation is translated, below, and a loop as a function, in test_batched
+        pytest.param(
+            ALL_SORTS,
+            {"metrics": {"residual_delay": 0.0, "residual_length": 0.004}},
+            marks=pytest.mark.long,
+        ),
         pytest.param(STIFFNESSES, HEAVY, marks=pytest.mark.long),
         pytest.param(STIFFNESSES, OTHER_SORTS, marks=pytest.mark.long),
     ],

@@ -269,7 +269,7 @@ def test_budget_from_the_command_line():
         with pytest.raises(StudyError, match=f"--{next(iter(bad))}"):
             make_budget(STUDY, **({"voltage": 20.0, "margin": 0.4} | bad))
     with pytest.raises(StudyError, match="--voltage: the design's loop is unstable"):
-        make_budget(STUDY.change(control__gain_factor=20.0), None, 0.4)
+        make_budget(study_of(MACHINE, control__gain_factor=20.0), None, 0.4)
 
 
 def tuned(candidate, study):

@@ -6,6 +6,7 @@ import json
 import re
 from pathlib import Path
 from typing import NamedTuple
+from unittest import mock
 
 import jsonschema
 import numpy as np
@@ -86,11 +87,12 @@ def short(tmp_path_factory):
     folder = tmp_path_factory.mktemp("paper")
     cases = list(filter(is_short, paper_cases.paper_cases()))
     console = Console(record=True, width=120, file=io.StringIO())
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(paper_cases, "JUDGED", ())
-        few = {name: paper_figures.PAPER_FIGURES[name] for name in FIGURES}
-        patch.setattr(paper, "PAPER_FIGURES", few)
-        patch.setattr(report, "PAPER_FIGURES", few)
+    few = {name: paper_figures.PAPER_FIGURES[name] for name in FIGURES}
+    with (  # what is replaced is part of no program: they are kept
+        mock.patch.object(paper_cases, "JUDGED", ()),
+        mock.patch.object(paper, "PAPER_FIGURES", few),
+        mock.patch.object(report, "PAPER_FIGURES", few),
+    ):
         machines = paper.evaluate(other_machine(), short_study(), cases, lambda *_: None)
         papers.run_card(card_of(machines), folder, console)
     return Short(folder, machines, console.export_text())

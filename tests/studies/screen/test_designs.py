@@ -6,6 +6,7 @@ import shutil
 import threading
 import warnings
 from shlex import quote
+from unittest import mock
 
 import jax
 import numpy as np
@@ -212,12 +213,12 @@ def test_a_screen_has_the_values_of_a_sweep_by_the_linear_model(swept, tmp_path)
 
 
 @pytest.mark.parametrize("count", [128, pytest.param(1024, marks=pytest.mark.long)])
-def test_many_designs_side_by_side_are_as_few(tmp_path, monkeypatch, count):
+def test_many_designs_side_by_side_are_as_few(tmp_path, count):
     """As large screens run them; jaxlib 0.11.2 by itself gives NaN where many are prepared."""
     spec = small_spec(SWEEP | {"count": count})
-    few = screened(tmp_path / "few", spec, shard_size=count, keep=count)
-    monkeypatch.setattr(shards, "LANES", 512)
-    many = screened(tmp_path / "many", spec, shard_size=count, keep=count)
+    few = screened(tmp_path / "few", spec, keep=count)
+    with mock.patch.object(shards, "LANES", 512):  # programs are kept by their sizes
+        many = screened(tmp_path / "many", spec, shard_size=count, keep=count)
     order = [np.argsort(done.tally.row) for done in (many, few)]
     rows, values = (
         [getattr(x.tally, name)[k] for x, k in zip((many, few), order, strict=True)]
@@ -229,11 +230,12 @@ def test_many_designs_side_by_side_are_as_few(tmp_path, monkeypatch, count):
     np.testing.assert_array_equal(many.tally.endings, few.tally.endings)
 
 
-def test_copies_of_good_designs_displace_no_others(tmp_path, monkeypatch):
-    monkeypatch.setattr(shards, "CANDIDATES", 20)
+def test_copies_of_good_designs_displace_no_others(tmp_path):
     gains = np.linspace(0.3, 1.0, 8).tolist()
-    spec = small_spec(SWEEP | {"count": 64, "axes": {"gain": gains}})
-    done = screened(tmp_path / "screen", spec, keep=8)
+    axes = {"patches.centers": [[0.05, 0.1, 0.15]], "gain": gains}  # as in AXES: one program
+    spec = small_spec(SWEEP | {"count": 64, "axes": axes})
+    with mock.patch.object(shards, "CANDIDATES", 20):  # of no program
+        done = screened(tmp_path / "screen", spec, keep=8)
     assert done.n_kept == 8
     assert done.tally.endings[status.OK] <= 16  # a copy in each shard
     assert done.tally.endings[LEFT_OUT] == 64 - done.tally.endings[:LEFT_OUT].sum()
@@ -296,8 +298,8 @@ def test_designs_with_the_margin_asked_for_are_kept(whole, swept, tmp_path):
     assert len(order) == KEEP  # enough have even the largest one
 
 
-def test_nothing_is_kept_where_no_design_has_the_margin(tmp_path):
-    screened(tmp_path)
+def test_nothing_is_kept_where_no_design_has_the_margin(whole, tmp_path):
+    shutil.copytree(whole[0], tmp_path, dirs_exist_ok=True)
     assert (tmp_path / BEST).exists()
     none = screened(tmp_path, margin=60.0)
     assert none.n_kept == 0 and not (tmp_path / BEST).exists()
@@ -575,6 +577,7 @@ def test_report_of_axes_of_text(tmp_path):
 
 def test_the_report_tells_what_margin_costs(whole, tmp_path):
     """The table holds what is kept, under the numbers in best.toml."""
+    shutil.copytree(whole[0], tmp_path, dirs_exist_ok=True)
     done = screened(tmp_path, SPEC, margin=2.5)
     selection = done.selection
     write_screen_report(tmp_path, done)
@@ -591,7 +594,8 @@ def test_the_report_tells_what_margin_costs(whole, tmp_path):
     assert "gain_margin >= 2.5" in html.unescape(text)
 
 
-def test_ends_of_axes_are_pointed_out(tmp_path):
+def test_ends_of_axes_are_pointed_out(whole, tmp_path):
+    shutil.copytree(whole[0], tmp_path, dirs_exist_ok=True)
     done = screened(tmp_path, keep=128)
     selection, axes, name = done.selection, done.screen.axes, "control.gain_factor"
     gain = axis_columns(selection.table)[name]
@@ -612,8 +616,8 @@ def test_nothing_is_kept_where_no_design_ends_well(tmp_path, capsys):
     from studies.study.template import toml_text
 
     file, out = tmp_path / "sweep.toml", tmp_path / "out"
-    gain = {"from": 500.0, "to": 1000.0}
-    file.write_text(toml_text(small(SWEEP | {"count": 8, "where": "", "axes": {"gain": gain}})))
+    axes = AXES | {"gain": {"from": 500.0, "to": 1000.0}}
+    file.write_text(toml_text(small(SWEEP | {"count": 8, "where": "", "axes": axes})))
     main(["screen", str(file), "--out", str(out)])
     text = capsys.readouterr().out
     assert "no design ended well; nothing is kept" in text and BEST not in text

@@ -485,7 +485,7 @@ AXES = (
 )
 
 
-@settings(max_examples=400, deadline=None, database=None, derandomize=True)
+@settings(max_examples=200, deadline=None, database=None, derandomize=True)
 @given(
     st.one_of(
         st.tuples(st.sampled_from(KEYS), anything).map(lambda kv: MIXED | {kv[0]: kv[1]}),

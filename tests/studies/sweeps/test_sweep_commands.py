@@ -3,7 +3,9 @@
 import dataclasses
 import json
 import re
+from functools import partial
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -18,8 +20,10 @@ from studies.engine.preflight import check_run
 from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import run_study
 from studies.errors import StudyError
+from studies.explorer.replays import rows_to_replay
 from studies.study.consistency import patch_centers
 from studies.study.template import toml_value
+from studies.sweeps import explore
 from studies.sweeps.report import report
 from tests import canonical
 from tests.canonical import MACHINE
@@ -168,7 +172,8 @@ def check_uncontrolled(capsys, spec, folder):
 
 
 def check_explorer(capsys, out):
-    code, text, _ = run(capsys, "explore", out)
+    with mock.patch.object(explore, "rows_to_replay", partial(rows_to_replay, most=2)):
+        code, text, _ = run(capsys, "explore", out)
     assert code == 0 and text.endswith(f"explorer: {out / 'explorer.html'}\n")
     data, numbers = unpacked((out / "explorer.html").read_text(encoding="utf-8"))
     sweep = read_sweep(out)
