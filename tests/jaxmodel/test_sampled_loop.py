@@ -480,6 +480,7 @@ def test_spillover_is_what_damping_of_the_uncontrolled_modes_loses():
     assert 1.01 < found[1] < found[2]
 
 
+@pytest.mark.long  # in short: slopes of a tuning's limits
 def test_spillover_has_a_gradient():
     structure, case = arrays(link__modes=5)
 

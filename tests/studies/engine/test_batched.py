@@ -189,6 +189,7 @@ def test_a_wrong_name_is_refused(wrong, said):
         batched(STUDY, [*NAMES, wrong])
 
 
+@pytest.mark.long
 def test_what_a_study_does_not_have_can_vary(results, wide):
     """A program for a study without wrench, friction or position gain takes them as names."""
     gain, tolerance, _, wrench, friction, position = wide[5]

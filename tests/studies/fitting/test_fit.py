@@ -251,6 +251,7 @@ def test_a_wrong_model_is_noticed(folder, bench):
     assert not answer.is_explained and not answer.misfits[0].is_noise
 
 
+@pytest.mark.long
 def test_the_paper_s_frequencies_from_modulus_and_joint(tmp_path):
     """92.5 and 241.3 Hz: a joint inertia of about 1.1e-5 kg m2 is inside the interval."""
     free = {

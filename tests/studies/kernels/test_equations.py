@@ -146,6 +146,7 @@ def test_a_sweep_runs_by_the_scan_and_says_so(capsys, tmp_path, no_structure):
     assert line.startswith("executor: XLA scan (JAX") and "KeyError: 'num_consts'" in line
 
 
+@pytest.mark.long
 def test_the_results_are_those_of_the_kernel(no_structure, monkeypatch):
     structure, cases = smallest(LAYOUT.size)
     runs = Executor(structure, LAYOUT)

@@ -486,6 +486,7 @@ def test_damaged_tallies_are_refused(whole, tmp_path):
     assert_same(read_tally(tmp_path, done.screen)[1], done.tally)
 
 
+@pytest.mark.long  # in short: of the linear model
 def test_full_model_of_the_same_designs(whole, tmp_path):
     """The true best ones, without a table of all cases."""
     full = screened(tmp_path / "full", fidelity="full")
