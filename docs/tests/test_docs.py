@@ -18,6 +18,7 @@ from studies.cli import app
 from studies.single.run import write_results
 from studies.space.spec import parse_sweep
 from studies.study.spec import Section, Study, parse_study
+from studies.tuning.spec import load_tuning
 from tests.documents import NOTEBOOKS, PAGES, TOP, blocks, page
 
 SITE = TOP / "docs"
@@ -249,6 +250,13 @@ def test_commands_of_the_documents_exist_with_their_options():
 def test_ready_made_files_that_documents_name_exist():
     listed = re.findall(r"init \S+ --from (\w+)", "\n".join(map(prose, PAGES)))
     assert {f"{x}.toml" for x in listed} <= {x.name for x in (TOP / "studies/specs").iterdir()}
+
+
+def test_ready_tunings_are_valid():
+    paths = sorted((TOP / "studies/specs").glob("*tune*.toml"))
+    assert len(paths) >= 6
+    for path in paths:
+        assert len(load_tuning(path).free.names) > 1
 
 
 # the site

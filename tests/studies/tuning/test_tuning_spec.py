@@ -1,6 +1,5 @@
 """Free numbers of a tuning and what a tuning file may ask for."""
 
-from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
 
@@ -10,7 +9,6 @@ import pytest
 
 from jaxmodel.metrics import Metrics
 from studies.errors import StudyError
-from studies.study import spec as spec_module
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.numbers import one_study
 from studies.study.paths import Parts, set_value
@@ -24,7 +22,7 @@ from studies.tuning.objective import (
     tail_weights,
 )
 from studies.tuning.scenarios import lane_columns, scenario_columns, tuned_machines
-from studies.tuning.spec import load_tuning, parse_tuning
+from studies.tuning.spec import parse_tuning
 from tests.tunings import EVERY_KIND, GAIN, SMALL, tuning
 
 
@@ -541,13 +539,6 @@ def test_moves_may_have_unequal_paths():
     )
     lanes = lane_columns(spec, scenario_columns(spec, 1, 0), [None, spec.families[0]])
     assert [len(path) for path in lanes["motion.waypoints"]] == [2, 3, 2, 3]
-
-
-def test_ready_tunings_are_valid():
-    paths = sorted(Path(spec_module.__file__).parents[1].glob("specs/*tune*.toml"))
-    assert len(paths) >= 6
-    for path in paths:
-        assert len(load_tuning(path).free.names) > 1
 
 
 LAWS_TUNED = {
