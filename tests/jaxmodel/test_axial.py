@@ -371,6 +371,8 @@ def test_margins_move_with_the_forces_of_the_motion():
     np.testing.assert_allclose(found.gain_margin[0], at_rest, rtol=1e-3)
     assert found.time[0] == 0 and np.abs(found.axial_force[0]).max() < 1e-9
     assert 8 < np.abs(found.axial_force).max() < 14
+    pull, push = found.axial_force.max(axis=0), -found.axial_force.min(axis=0)
+    np.testing.assert_allclose(pull, push, rtol=0.1)  # of every link: it brakes as hard
     moved = np.abs(found.gain_margin / at_rest - 1).max()
     assert 1e-4 < moved < 0.02  # mode 7 decides, which hardly feels N
 

@@ -123,8 +123,10 @@ class FakeCluster:
         self.answers = {row: list(given) for row, given in answers.items()}
         self.n_workers = workers
         self.submitted, self.flying, self.most, self.with_others = [], set(), 0, []
+        self.jobs = []
 
     def submit(self, function, job, **_):
+        self.jobs.append(job)
         self.submitted.append(int(job.rows[0]))
         self.with_others.append(len(self.flying))
         future = (len(self.submitted), int(job.rows[0]))
@@ -149,10 +151,18 @@ class FakeCluster:
 @pytest.fixture
 def on_cluster(monkeypatch):
     """What a runner yields, with which chunks, for answers by chunk."""
-    spec = small_spec({"axes": {"gain": {"from": 0.1, "to": 1.0, "count": 20}}})
+    gain = {"from": 0.1, "to": 1.0, "count": 10}
+    spec = small_spec({"axes": {"control.ratio_source": ["given", "own_run"], "gain": gain}})
     table = build_table(spec)
-    groups = plan_groups(table, np.arange(20), lambda n, structure: Layout(1, 1, 4))
-    assert [len(group.chunks()) for group in groups] == [5]
+    parts = (np.arange(8), ()), (np.arange(8, 20), ("delay_margin",))
+    groups = [
+        group
+        for rows, figures in parts
+        for group in plan_groups(
+            table, rows, lambda n, structure: Layout(1, 1, 4), robustness=figures
+        )
+    ]
+    assert [len(group.chunks()) for group in groups] == [2, 3]
 
     def outcome(answers, **options):
         fake = FakeCluster(answers, **options)
@@ -175,6 +185,14 @@ def test_every_chunk_comes_back_once(on_cluster):
     assert {x.judged for x in found} == {f"judged {k}" for k in (0, 4, 8, 12, 16)}
     assert all(x.judged == f"judged {x.chunk.rows[0]}" for x in found)
     assert fake.most == 2 * AHEAD  # few are under way
+
+
+def test_a_job_asks_for_what_the_cases_of_its_own_group_need(on_cluster):
+    """Of two groups, the second has ratios from runs without control, and delay margins."""
+    fake, _ = on_cluster({})
+    asked = {int(job.rows[0]): (job.has_own_ratio, job.robustness) for job in fake.jobs}
+    plain, more = (False, ()), (True, ("delay_margin",))
+    assert asked == {0: plain, 4: plain, 8: more, 12: more, 16: more}
 
 
 def test_a_chunk_that_fails_once_is_tried_again_alone(on_cluster):

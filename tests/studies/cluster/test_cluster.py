@@ -19,7 +19,7 @@ from rich.console import Console
 from studies.cluster import connect
 from studies.cluster.connect import Workers, connected
 from studies.cluster.runner import ClusterRunner
-from studies.cluster.worker import identity
+from studies.cluster.worker import difference, identity
 from studies.engine import plan
 from studies.engine.chunks import LocalRunner
 from studies.engine.columns import NOT_RUN
@@ -195,6 +195,13 @@ def test_a_worker_that_dies_when_asked_is_no_other_version():
     answers["tcp://c"] = OSError("no such file")
     with pytest.raises(StudyError, match="do not match this client: tcp://c: no such file;"):
         connect.refuse_other_versions(SimpleNamespace(run=lambda *_, **__: answers))
+
+
+def test_a_version_that_a_worker_does_not_tell_is_another_one():
+    own = identity()
+    assert difference(own, own) == ""
+    told = {name: x for name, x in own.items() if name != "numpy"}
+    assert difference(told, own) == f"numpy None (client: {own['numpy']})"
 
 
 def test_a_frozen_worker_does_not_hold_up_what_connects(cluster, monkeypatch):

@@ -237,6 +237,15 @@ def test_the_smallest_change_is_on_the_limit(design, found):
     assert np.argmax([abs(part.size) for part in found.parts]) == 0
 
 
+def test_of_channels_that_act_one_at_a_time_the_first_to_break_counts(design, found, monkeypatch):
+    """Wherever it is among them: here after one that nothing breaks and one that takes twice it."""
+    nearest = np.concatenate([np.ravel(part) for part in found.change]) / design.unit
+    limits = iter([None, 2 * nearest, nearest])
+    monkeypatch.setattr(breaking, "linear_parts", lambda law: [(slice(None), law)] * 3)
+    monkeypatch.setattr(breaking, "nearest_unstable", lambda loops: next(limits))
+    assert smallest_change(design.fixed).text == found.text
+
+
 def shell(design, distance, count, rng):
     """Random changes at a distance: of all numbers, of few, or near the coordinate axes."""
     points = rng.normal(size=(count, len(design.unit)))

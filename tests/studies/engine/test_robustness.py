@@ -20,7 +20,7 @@ from jaxmodel.prepare import prepare
 from jaxmodel.robustness import _refined, coarse_norm, margin_at, norm_peaks, search_frequencies
 from jaxmodel.sampled_loop import analogue_plant, closed_loop, delayed_loop
 from jaxmodel.scaling import best_scaling
-from studies.engine import diagonal_scaling
+from studies.engine import diagonal_scaling, robustness
 from studies.engine.delay_check import DelayedLoops
 from studies.engine.loop_gain import loop_gains
 from studies.engine.margins import judge_loops
@@ -534,6 +534,23 @@ def test_gradients_are_those_of_differences():
         ends = [1 + sign * step * unit for sign in (1, -1)]
         high, low = (np.asarray(figures(x, places(x))) for x in ends)
         np.testing.assert_allclose(slope[:, k], (high - low) / (2 * step), rtol=1e-4, atol=1e-5)
+
+
+def test_of_modes_that_act_one_at_a_time_the_worst_figures_count(monkeypatch):
+    """Of each of two loops: the smaller margin and the larger peak, whichever mode has it."""
+    study = STUDY.change(control__law="modified_imsc", control__modes=2)
+    structure = build_structure(study)
+    cases = build_cases(study, {"control.gain_factor": np.array([0.1, 0.2])}, structure)
+    parts = [
+        {"disk_margin": np.array([0.5, 0.9]), "sensitivity_peak": np.array([2.0, 4.0])},
+        {"disk_margin": np.array([0.7, 0.2]), "sensitivity_peak": np.array([3.0, 1.5])},
+    ]
+    made_up = iter(parts)
+    monkeypatch.setattr(robustness, "_figures_of", lambda *_: next(made_up))
+    found = judge_robustness(structure, cases, tuple(parts[0]), np.array([2.0, 2.0]))
+    assert next(made_up, None) is None
+    np.testing.assert_array_equal(found["disk_margin"], [0.5, 0.2])
+    np.testing.assert_array_equal(found["sensitivity_peak"], [3.0, 4.0])
 
 
 @pytest.mark.long

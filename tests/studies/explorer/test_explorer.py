@@ -104,7 +104,12 @@ def test_of_too_many_cases_the_best_and_a_spread_are_shown():
     assert set(table.order[:1000]) <= set(rows)
     failed = table.status[rows] != 0
     assert 0.5 < failed.mean() / (table.status != 0).mean() < 1.5
-    assert f"{len(rows):,} of {3 * MOST_CASES:,} cases" in explorer_page(table)
+    page = explorer_page(table)
+    assert f"{len(rows):,} of {3 * MOST_CASES:,} cases" in page
+    data, numbers = unpacked(page)
+    shown = [int(name) for name in data["names"]]  # each beside the numbers of its own case
+    kept = numbers(data["columns"][0]["value"])
+    np.testing.assert_allclose(kept, table.columns[0].value[shown], rtol=1e-6)
     assert "the best by residual_rms" not in explorer_page(table_of(100))
 
 

@@ -256,6 +256,22 @@ def test_cases_that_differ_in_motion_alone_share_a_loop():
     np.testing.assert_allclose(found.least_damping, wanted.least_damping, rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("drive.kp", [2e4, 2e4, 1e4]),
+        ("electronics.antialias_hz", [2e3, 2e3, 1e3]),
+        ("load.mass", [0.0, 0.0, 0.1]),
+        ("link.modes", [3, 3, 2]),
+    ],
+)
+def test_cases_that_differ_in_their_machine_have_loops_of_their_own(name, values):
+    columns = {name: np.array(values)}
+    first, own = distinct_loops(build_cases(STUDY, columns, build_structure(STUDY, columns)))
+    np.testing.assert_array_equal(first, [0, 2])
+    np.testing.assert_array_equal(own, [0, 0, 1])
+
+
 def test_what_breaks_in_words():
     assert breaking_text(np.nan, np.nan) == ""
     assert breaking_text(10.0, 1214.0) == "mode 10 of the links, 1.21e+03 Hz"

@@ -5,7 +5,8 @@ import pytest
 
 from jaxmodel import status
 from jaxmodel.sampled_loop import closed_loop
-from studies.engine.columns import LEFT_OUT
+from studies.engine import screen
+from studies.engine.columns import LEFT_OUT, labelled
 from studies.engine.executor import Executor
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.results import metric_values, read_sweep
@@ -191,6 +192,8 @@ def test_linear_runs_are_judged_like_others(folders):
     np.testing.assert_allclose(linear["gain_margin"], full["gain_margin"], rtol=1e-9)
     value, other = (metric_values(data, "residual_rms") for data in (full, linear))
     assert 0 < np.nanmax(np.abs(other / value - 1)) < 0.05  # 2 mm in 10 ms
+    rms, without = (data.baseline["residual_rms"].data for data in (full, linear))
+    assert 1e-3 < np.abs(without / rms - 1).max() < 0.1  # and so for the run without control
     assert "All runs are of the linear model" in text_of(report(linear, "residual_rms", []))
 
 
@@ -274,6 +277,24 @@ def test_what_is_recommended_meets_the_screens_condition(tmp_path, folders):
     write_sweep_report(tmp_path / "s")
     text = text_of((tmp_path / "s" / "report.html").read_text(encoding="utf-8"))
     assert f'--subject-to "{ENDS} > {limit} and gain_margin >= 2"' in text
+
+
+def test_cases_that_saturate_do_not_meet_the_screens_condition(monkeypatch, tmp_path):
+    """Although they have metrics: without enough others, the screen goes further down."""
+    spec = screened(subject_to="residual_rms < 1e-6")
+    table, order = build_table(spec), np.arange(64)
+    first = screen.first_round(table, order, spec)
+    assert len(first.first) == 8
+
+    def further(codes):
+        arrays = {"status": np.array(codes), "residual_rms": np.full((8, 3, 3), 1e-9)}
+        made_up = {x: labelled(x, a) for x, a in arrays.items()}
+        monkeypatch.setattr(screen, "gather", lambda *_: made_up)
+        return screen.next_round(table, order, spec, first, tmp_path)
+
+    assert further([status.OK] * 8) is None
+    more = further([status.OK] * 7 + [status.SATURATED])
+    assert more is not None and len(more.first) == 12  # 1.25 * 8 * 8 / 7
 
 
 def test_a_screen_without_fields_has_the_defaults():

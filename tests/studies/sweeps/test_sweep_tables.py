@@ -116,6 +116,21 @@ def test_best_cases_come_in_their_order(by, subject_to, wanted):
     assert ranked_cases(data, by, subject_to, 2).tolist() == wanted[:2]
 
 
+@pytest.mark.parametrize(
+    ("name", "wanted"),
+    [
+        ("disk_margin", "largest"),
+        ("phase_margin", "largest"),
+        ("delay_margin", "largest"),
+        ("sensitivity_peak", "smallest"),
+    ],
+)
+def test_the_best_of_margins_are_the_largest_and_of_peaks_the_smallest(name, wanted):
+    rising = [3, 7, 6, 4, 2, 1, 0, 5]
+    best = ranked_cases(usual(**{name: MARGINS}), name).tolist()
+    assert best == (rising if wanted == "smallest" else rising[::-1])
+
+
 def test_cases_without_the_number_are_never_best():
     """Not finite, or not ok: also where more are asked for than have it."""
     rms = of_stations(RMS)
