@@ -284,10 +284,11 @@ def test_an_audit_finds_a_falsified_derivative(monkeypatch, error):
 
 @pytest.mark.parametrize(("stored", "wanted"), [(status.OK, 0), (status.SATURATED, 1), (None, 0)])
 def test_a_replay_that_ends_otherwise_fails(capsys, monkeypatch, stored, wanted):
-    replay = single_run.Replay(
-        SimpleNamespace(study=SimpleNamespace(title="this"), status=status.OK), stored, 1e-7, "x"
-    )
-    monkeypatch.setattr(single_run, "replay", lambda *_: replay)
+    again = SimpleNamespace(study=SimpleNamespace(title="this"), status=status.OK)
+    kept = SimpleNamespace(study=None, stored={} if stored is None else {"status": stored})
+    monkeypatch.setattr(single_run, "load_design", lambda *_: kept)
+    monkeypatch.setattr(single_run, "run_study", lambda _: again)
+    monkeypatch.setattr(single_run, "deviation", lambda *_: (1e-7, "x"))
     code, text, _ = run(capsys, "replay", "folder", "--case", "1")
     assert code == wanted and "this: ok" in text
     assert ("CAUTION: the sweep and this run end differently." in text) == bool(wanted)

@@ -163,6 +163,11 @@ def test_modes_of_two_links_are_named(gantry):
     # drawn as far to either side as the larger of both bends
     moved = np.abs(parts.link[1:] - parts.link[0]).max()
     assert 0.05 < moved / study.link.length < 0.2
+    # and where mode 1 is positive, to the left of the way from B to C
+    chord, middle = parts.joint[1] - parts.near[1], parts.link[1, :, parts.link.shape[2] // 2]
+    away = middle - (parts.joint[1] + parts.near[1]) / 2
+    left = chord[:, 0] * away[:, 1] - chord[:, 1] * away[:, 0]
+    np.testing.assert_array_equal(np.sign(left), np.sign(bending[2:].reshape(2, -1)[:, 0]))
 
 
 def test_defaults_follow_the_mechanism_and_what_was_given_stays():

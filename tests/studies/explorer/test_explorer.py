@@ -5,16 +5,21 @@ import os
 import re
 from base64 import b64encode
 from hashlib import sha256
+from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import pytest
 
 from studies.engine.front import pareto_front
 from studies.errors import StudyError
+from studies.explorer import replays
 from studies.explorer.page import explorer_page, write_explorer
-from studies.explorer.replays import exaggeration, rows_to_replay
+from studies.explorer.replays import exaggeration, replayed, rows_to_replay
 from studies.explorer.table import MOST_CASES, Column, ExplorerTable, shown_rows, text_column
 from studies.extensions import VARIABLE, options
+from studies.show.skeleton import Skeleton
+from studies.study.spec import paper_study
 from tests.browser import opened
 from tests.pages import TITLE, about, unpacked
 from tests.studies.test_cli import refused
@@ -77,6 +82,31 @@ def test_bending_too_small_to_see_is_not_drawn(peak, factor):
     assert exaggeration(peak, 0.2) == pytest.approx(factor)
 
 
+def bent_run(peak):
+    """A run of 0.2 s whose reference trajectory ends after 0.1 s and whose links bend so much."""
+    time = np.linspace(0, 0.2, 201)
+    record = SimpleNamespace(time=time, pose=np.zeros(201), modal_coordinate=np.zeros(201))
+    result = SimpleNamespace(record=record, command_end=0.1)
+    bent = np.full((201, 3), -peak)
+    return SimpleNamespace(result=result, study=paper_study(), bent=bent)
+
+
+def test_a_case_and_its_baseline_are_drawn_by_the_larger_bending_from_the_end_of_the_move():
+    still = Skeleton(np.zeros((1, 3, 2, 2)), *2 * [np.zeros((1, 3, 2))], np.zeros((1, 3, 9, 2)))
+    with mock.patch.multiple(
+        replays,  # of no program
+        run_study=lambda *_, **__: bent_run(1e-4),
+        uncontrolled_twin=lambda _: bent_run(1.6e-3),
+        chord_deflection=lambda run: run.bent,
+        skeleton=lambda *_: still,
+    ):
+        (case,) = replayed([7], lambda _: None, lambda *_: None)
+    assert case.row == 7 and case.exaggeration == 10  # 16 mm of 0.2 m
+    assert [x.deflection[0, 0] for x in case.motions] == pytest.approx([-100, -1600])
+    assert (case.time[0], case.time[-1]) == pytest.approx((-100, 100))
+    assert (case.frame_time[0], case.frame_time[-1]) == pytest.approx((-100, 50), abs=1)
+
+
 def test_a_command_names_the_files_that_were_loaded(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     names = [str(tmp_path / "my laws.py"), str(tmp_path / "more.py")]
@@ -111,6 +141,18 @@ def test_of_too_many_cases_the_best_and_a_spread_are_shown():
     kept = numbers(data["columns"][0]["value"])
     np.testing.assert_allclose(kept, table.columns[0].value[shown], rtol=1e-6)
     assert "the best by residual_rms" not in explorer_page(table_of(100))
+
+
+def test_cases_that_failed_come_last_whatever_their_figures():
+    """Saturated ones have figures, too."""
+    table = table_of(50)
+    failed = table.status != 0
+    residual = np.where(failed, 1e-3, table.column("residual_rms").value)
+    order = table._replace(
+        columns=(Column("residual_rms", "µm", residual, better="smallest"),)
+    ).order
+    assert failed[order].tolist() == sorted(failed)
+    assert np.all(np.diff(residual[order[: np.sum(~failed)]]) >= 0)
 
 
 @pytest.mark.parametrize("seed", range(5))

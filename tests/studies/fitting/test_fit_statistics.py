@@ -8,7 +8,7 @@ from scipy.stats import chi2, norm
 
 from studies.fitting.kinds.contract import Residual
 from studies.fitting.problem import Problem
-from studies.fitting.profiles import Likelihood, profile
+from studies.fitting.profiles import Likelihood, describe_confirmed, profile
 from studies.fitting.report import _misfit, _others
 from studies.fitting.solve import Solution
 from studies.fitting.statistics import UNKNOWN, describe_fit, misfit, spread
@@ -96,6 +96,19 @@ def test_a_profile_rises_by_3_84_at_the_ends_of_its_interval(size, number):
     level = ((ends - value) / sigma) ** 2
     np.testing.assert_allclose(level, chi2.ppf(0.95, 1), rtol=1e-3)
     assert chi2.ppf(0.95, 1) == pytest.approx(3.84, abs=2e-3)
+
+
+@pytest.mark.parametrize("place", [0.4, 0.0])
+def test_profiles_of_a_linear_problem_confirm_its_derivatives(place):
+    """Also of a number at its bound, where the data end the profile on the other side only."""
+    one, u, *_ = problem(2)
+    u[0] = place
+    one.measurements[0].best = one.free.values(u)
+    wanted = describe_fit(one, u)
+    found, profiles = describe_confirmed(one, u, has_all=True)
+    assert [x.ends for x in profiles] == [2 if place else 1, 2]
+    np.testing.assert_allclose(found.sigma, wanted.sigma, rtol=1e-3)
+    np.testing.assert_allclose(found.interval, wanted.interval, rtol=1e-3)
 
 
 def test_a_profile_that_does_not_rise_enough_ends_where_it_was_tried():

@@ -1,6 +1,7 @@
 """`studies laws`: candidates, what they are judged on, and whether an order is certain."""
 
 import json
+from types import SimpleNamespace
 from unittest import mock
 
 import jax
@@ -11,11 +12,14 @@ import pytest
 from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import check_law
+from jaxmodel.loop_figures import MARGINS
 from jaxmodel.table import PartError
 from studies.engine.chunks import distinct_loops, judge_cases
+from studies.engine.columns import labelled
 from studies.engine.margins import judge_loops
+from studies.engine.results import SweepData
 from studies.errors import StudyError
-from studies.laws import candidates
+from studies.laws import candidates, judging
 from studies.laws import run as laws
 from studies.laws.candidates import (
     AS_GIVEN,
@@ -25,10 +29,21 @@ from studies.laws.candidates import (
     law_candidate,
     law_candidates,
 )
-from studies.laws.findings import beyond_budget
-from studies.laws.judging import MOVES, breaking_text, changes, judging_sweep, longer
+from studies.laws.findings import Combination, beyond_budget, find
+from studies.laws.judging import (
+    FIGURES,
+    MOVES,
+    SHOWN,
+    Judged,
+    breaking_text,
+    changes,
+    judging_sweep,
+    longer,
+    read_judged,
+)
 from studies.laws.machines import machines_of, spread_of, with_noise
 from studies.laws.ranking import rank
+from studies.laws.report import HEADS, table_rows
 from studies.laws.tuning import (
     Budget,
     Quality,
@@ -77,6 +92,15 @@ def test_an_interval_covers_the_true_ratio_as_often_as_it_says():
         ranking = rank(figure, seed)
         hits += ranking.best == 0 and ranking.low[1] <= 1.5 <= ranking.high[1]
     assert 88 <= hits <= 99  # 95 % of 100, and bootstrap intervals are a little short
+
+
+def test_an_interval_is_of_95_percent():
+    """Of many machines, 1.96 standard deviations of the mean to either side."""
+    noise = np.random.default_rng(0).normal(size=400)
+    figure = np.exp([np.zeros(400), 1 + 0.3 * noise / noise.std()])[:, :, None]
+    ranking = rank(figure)
+    width = np.log(ranking.high[1] / ranking.low[1])
+    assert width == pytest.approx(2 * 1.96 * 0.3 / np.sqrt(400), rel=0.06)
 
 
 def test_a_lost_run_takes_a_controller_out():
@@ -272,6 +296,24 @@ def test_cases_that_differ_in_their_machine_have_loops_of_their_own(name, values
     np.testing.assert_array_equal(own, [0, 0, 1])
 
 
+def test_what_breaks_is_told_of_the_machine_with_the_least_gain_margin():
+    machine = np.repeat([0, 1, 2], len(MOVES))  # of each case
+    columns = {
+        "gain_margin": np.array([np.nan, 3.0, 1.5])[machine],
+        "breaking_mode": np.array([np.nan, 1.0, 2.0])[machine],
+        "breaking_frequency": np.array([np.nan, 100.0, 200.0])[machine],
+        "pose_error_peak": np.zeros((9, 3)),
+        "pose_error_rms": np.zeros((9, 3)),
+    }
+    names = (*MARGINS, "status", *FIGURES, *SHOWN)
+    arrays = dict.fromkeys(names, np.zeros(9)) | columns
+    variables = {name: labelled(name, x) for name, x in arrays.items()}
+    data = SweepData(variables, {}, None, SimpleNamespace(origin=np.arange(9)))
+    with mock.patch.object(judging, "read_sweep", lambda _: data):
+        (text,) = read_judged(None, 1, 3).breaking
+    assert text == "mode 2 of the links, 200 Hz"
+
+
 def test_what_breaks_in_words():
     assert breaking_text(np.nan, np.nan) == ""
     assert breaking_text(10.0, 1214.0) == "mode 10 of the links, 1.21e+03 Hz"
@@ -286,6 +328,34 @@ def test_budget_from_the_command_line():
             make_budget(STUDY, **({"voltage": 20.0, "margin": 0.4} | bad))
     with pytest.raises(StudyError, match="--voltage: the design's loop is unstable"):
         make_budget(study_of(MACHINE, control__gain_factor=20.0), None, 0.4)
+
+
+def made_up(margin, energy=0.0):
+    """A comparison whose controllers have gain margins (N, M), as if run without control."""
+    shape = (*np.shape(margin), len(MOVES))
+    judged = Judged(
+        metrics={name: np.ones(shape) for name in (*FIGURES, *SHOWN)}
+        | {"control_energy": np.full(shape, energy)},
+        status=np.zeros(shape, int),
+        margins=dict.fromkeys(MARGINS, np.ones(shape[:2])) | {"gain_margin": np.array(margin)},
+        breaking=[""] * len(margin),
+    )
+    still = STUDY.change(control__feedback="none")
+    entries = [Combination(str(k), "", "", still, "", 1) for k in range(len(margin))]
+    return find(STUDY, Budget(50.0, 0.4), [], judged, entries)
+
+
+def test_a_controller_that_one_machine_makes_unstable_is_out():
+    findings = made_up([[1.2, 0.9, 1.5], [1.2, 1.0, np.nan]])
+    assert findings.controllers[0].reason == "unstable on 1 of 3 machines"
+    assert findings.competing == [1]
+
+
+def test_the_rms_voltage_is_that_of_each_actuator():
+    """Three on each of three links, at 2 V all the time."""
+    energy = 9 * 2.0**2 * longer(STUDY).run.duration
+    (row,) = table_rows(made_up([[2.0, 2.0]], energy))
+    assert row[HEADS.index("rms voltage, mean [V]")] == "2"
 
 
 def tuned(candidate, study):

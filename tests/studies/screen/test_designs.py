@@ -18,9 +18,10 @@ from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import run_uncontrolled
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
-from studies.screen import report, shards
+from studies.screen import report, selection, shards
 from studies.screen.report import margin_rows, quantile_rows, summary_lines, write_screen_report
 from studies.screen.run import LocalScreener, run_screen
+from studies.screen.selection import select
 from studies.screen.shards import axis_columns, screen_of
 from studies.screen.stored import BEST, TALLY, read_tally, write_tally
 from studies.screen.tally import (
@@ -87,7 +88,8 @@ def random_designs(count, seed=0):
 @pytest.mark.parametrize("is_largest", [False, True])
 def test_tallies_merge_in_any_order(is_largest):
     row, code, value, columns = random_designs(3000)
-    value[500:520] = value[500]  # ties
+    # ties, some of them kept: of equal ones, the earliest
+    value[500:580] = np.nanquantile(value, 0.99 if is_largest else 0.01)
     axes = divided(columns)
 
     def part(chosen):
@@ -256,6 +258,19 @@ def test_designs_that_repeat_others_are_kept_once(tmp_path):
     kept = load_sweep(tmp_path / "screen" / BEST)
     assert sorted(build_table(kept).columns["control.gain_factor"]) == [0.5, 0.7]
     assert done.n_kept == 2
+
+
+def test_designs_behind_a_repeated_one_keep_their_values():
+    """Shards do not see each other's designs, so a tally may hold the same one twice."""
+    cases = [{"control.gain_factor": gain} for gain in (0.5, 0.7, 0.5)]
+    screen = screen_of(small_spec({"method": "list", "cases": cases, "by": SWEEP["by"]}), margin=0)
+    tally = nothing(screen.axes)._replace(
+        row=np.array([2, 0, 1]), value=np.array([1e-6, 1e-6, 2e-6])
+    )
+    with mock.patch.object(selection, "_margins", lambda _, table: np.full(len(table), 2.0)):
+        found = select(screen, tally, threading.Event())
+    assert found.table.columns["control.gain_factor"].tolist() == [0.5, 0.7]
+    assert found.kept_value.tolist() == [1e-6, 2e-6]
 
 
 def test_kept_designs_are_a_sweep_with_the_same_ids(whole):

@@ -12,6 +12,7 @@ from jaxmodel.simulate import Result
 from studies.engine.runs import Run
 from studies.engine.stability import LoopFigures
 from studies.show.units import READABLE, headed, number, readable, settling_text
+from studies.show.words import control_text
 from studies.single.report import report
 from studies.study.cases import build_case, build_structure
 from studies.study.margin import caution, margin_in_db, margin_text
@@ -92,6 +93,18 @@ def test_words_of_a_margin(margin, text, words):
 )
 def test_a_margin_as_a_factor_and_in_decibels(margin, text):
     assert margin_in_db(margin) == text
+
+
+@pytest.mark.parametrize(
+    ("links", "words"),
+    [
+        ((True, False, True), " on links 1, 3, sampled feedback, "),
+        ((False, True, False), " on link 2, sampled feedback, "),
+        ((False, False, False), "no link controlled"),
+    ],
+)
+def test_links_that_are_controlled_are_counted_from_one(links, words):
+    assert words in control_text(paper_study().change(control__links=links))
 
 
 # --- one run --------------------------------------------------------------------------------------

@@ -81,6 +81,9 @@ def test_elementary_effects_see_interaction_and_survive_failures():
     # effect of x1 is x2: mean 1/2, spread that of the grid's levels
     np.testing.assert_allclose(found.mean, [0.5, 0.5, 1.0], atol=0.03)
     np.testing.assert_allclose(found.deviation, [0.34, 0.34, 0.0], atol=0.02)
+    # from -1/2 to 1/2 in steps of 1/5: they cancel in the mean, their sizes do not
+    both = elementary_effects(points, (points[:, 0] - 0.5) * points[:, 1])
+    np.testing.assert_allclose([both.mean[1], both.mean_size[1]], [0.0, 0.3], atol=0.02)
     value[::9] = np.nan
     broken = elementary_effects(points, value)
     assert broken.n_left_out > 500 and np.all(broken.n_used < 2000)

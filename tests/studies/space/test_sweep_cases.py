@@ -142,6 +142,9 @@ def test_id_and_seed_belong_to_the_case_not_to_the_sweep():
     np.testing.assert_array_equal(whole.case_id, entry.case_id)
     reseeded = table_of({"axes": {"gain": [0.25, 0.5, 1.0]}}, run={"duration": 0.025, "seed": 1})
     assert not set(one.case_id.tolist()) & set(reseeded.case_id.tolist())
+    swept = table_of({"axes": {"gain": [0.25, 0.5, 1.0], "run.seed": [1]}})
+    np.testing.assert_array_equal(swept.case_id, reseeded.case_id)
+    np.testing.assert_array_equal(swept.seed, reseeded.seed)
     assert len(np.unique(one.seed)) == 3
 
 

@@ -3,6 +3,7 @@
 import json
 import re
 from functools import partial
+from types import SimpleNamespace
 from unittest import mock
 
 import jax
@@ -27,10 +28,10 @@ from studies.engine.breaking import TOLERANCES, BreakingChange, ChangedNumber
 from studies.engine.controller import fixed_controller
 from studies.engine.fast_motion import FAST, WINDOW, make_fast
 from studies.engine.runs import run_study
-from studies.engine.stability import loop_report
+from studies.engine.stability import LoopFigures, loop_report
 from studies.errors import StudyError
 from studies.show.document import schema
-from studies.spillover import ModelMismatch, certify, patch_lengths
+from studies.spillover import ModelMismatch, certificate, certify, patch_lengths
 from studies.spillover import run as spillover_run
 from studies.spillover.fast_move import run_fast_move
 from studies.spillover.plants import LoopBuilder, all_plants, pad_channels
@@ -329,6 +330,22 @@ def test_parts_of_the_modified_law_are_its_channels(switching):
     np.testing.assert_allclose(sum(part.feedback.velocity_gain for _, part in parts), whole)
     assert [modes.start for modes, _ in parts] == [0, 1, 2]
     assert len(linear_parts(fixed_controller(STUDY).controller)) == 1
+
+
+def test_what_breaks_a_modified_law_is_its_mode_of_least_margin(switching):
+    """Of modes that are judged one by one: margin and words are of the same one."""
+    none = np.full((3, 3), np.nan)
+    figures = [
+        LoopFigures(margin, 0.9, breaking=text, frequency_hz=none, damping_ratio=none)
+        for margin, text in ((3.0, "first"), (1.5, "second"), (2.0, "third"))
+    ]
+    loop = SimpleNamespace(is_open_loop_stable=True, mode_poles=np.full((3, 3), -1.0 + 100.0j))
+    builder = SimpleNamespace(loop=lambda *_: loop)
+    design = SimpleNamespace(controller=switching, n_patches=3)
+    one = np.full((1, 1, 1), "", object)
+    with mock.patch.object(certificate, "judge_loop", lambda *_: figures.pop(0)):
+        found = certificate._judge_plants(design, builder, one, one)[0, 0, 0]
+    assert (found.figures.gain_margin, found.breaking) == (1.5, "second")
 
 
 def test_idle_channels_change_nothing():
