@@ -336,8 +336,8 @@ def plan(
 ) -> Rounds:
     """Rounds of tests that execute one of the lines, as many as the budget allows.
 
-    Those of files about the module itself come first, then the quickest. Where no test executes
-    any, as of a table that is made on import, those about the module do instead, or any.
+    Those of files about the module itself come first, then the quickest; one that is too slow for
+    what is left is passed over. Where no test executes any, as of a table that is made on import, those about the module do instead, or any.
 
     Args:
         seen: tests by file.
@@ -360,11 +360,9 @@ def plan(
     able = [x for x in every if x[-1]] or [x for x in every if not x[0]] or every
     rounds: Rounds = [{} for _ in ROUNDS]
     for _, seconds, file, node, _ in sorted(able, key=lambda x: x[:4]):
-        if node in passed:
+        if node in passed or (seconds > budget and any(rounds)):  # one at least
             continue
         budget -= seconds
-        if budget < 0 and any(rounds):  # one at least
-            break
         place = next(k for k, longest in enumerate(ROUNDS) if seconds <= longest)
         nodes = rounds[place].setdefault(file, [])
         assert nodes is not None

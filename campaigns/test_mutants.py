@@ -137,8 +137,9 @@ def test_a_mutant_is_judged_by_tests_that_execute_its_statement():
     mutant = Mutant(file, 6, 0, "", "", "")
     first, slow = {machines: ["quick"], observers: ["quick"]}, {beam: ["slow"]}
     assert plan(seen, mutant, {6}, 10.0) == [first, {}, slow]
-    # those about the module come first
-    assert plan(seen, mutant, {6}, 9.0) == [{machines: ["quick"]}, {}, {}]
+    # those about the module come first, and what is too slow for the rest of the budget is left out
+    assert plan(seen, mutant, {6}, 9.0) == [first, {}, {}]
+    assert plan(seen, mutant, {6}, 0.25) == [{machines: ["quick"]}, {}, {}]
     assert plan(seen, mutant, {6}, 1.0, {"quick"}) == [{}, {}, slow]
 
 
