@@ -19,8 +19,10 @@ from studies.space.indices import elementary_effects, sobol_indices
 from studies.space.table import build_table
 from studies.store import Variable
 from studies.sweeps.dry_run import axis_rows
+from studies.sweeps.explore import _figure
 from studies.sweeps.plots import front
 from studies.sweeps.report import report
+from studies.sweeps.screening import check_screen
 from studies.sweeps.sensitivity import analyse, failure_causes
 from studies.sweeps.show import (
     best_cases,
@@ -201,6 +203,7 @@ def test_settling_is_watched_to_the_end_of_each_case_s_own_run():
     data = made_up(axes, settling_time=settled, command_end=np.full(2, 0.01))
     rows = case_rows(data, np.arange(2), ["settling_time"]).rows
     assert [row[3] for row in rows] == ["not within 15", "14.9"]
+    np.testing.assert_allclose(_figure(data, "settling_time").value, [np.nan, 14.9])  # [ms]
 
 
 def test_what_varies_has_its_unit():
@@ -650,6 +653,14 @@ def test_a_report_names_links_that_no_case_controls():
     head = text_of(report(data, "residual_rms", [], "DIR")).partition("## ")[0]
     assert "case 0 with 2 µm (link_subsets = 1); link 2, which no case controls: 5 µm;" in head
     assert "largest of links 1 and 3 and all stations" in head
+
+
+def test_the_error_of_a_screen_is_a_share_of_the_full_model_s_value():
+    screen = {"by": "residual_rms", "keep": 1.0}
+    axes = {"axes": {"gain": GAINS}, "metrics": ["residual_rms"], "screen": screen}
+    half = {"screen_status": np.zeros(8, int), "screen_value": 0.5 * RMS}
+    checked = check_screen(made_up(axes, residual_rms=of_stations(RMS), **half))
+    assert "On 8 random cases the linear model is off by 50 % in the median" in checked.text
 
 
 def test_ties_keep_the_order_of_the_cases():

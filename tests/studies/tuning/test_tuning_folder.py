@@ -29,7 +29,7 @@ from studies.tuning.folder import open_tuning
 from studies.tuning.loop_figures import DesignFigures
 from studies.tuning.objective import objective_of
 from studies.tuning.optimise import begin, is_compatible
-from studies.tuning.report import TuneFindings, n_outside, report
+from studies.tuning.report import TuneFindings, best_family, n_outside, report
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import load_tuning, parse_tuning
 from tests.pages import about, parsed, text_of
@@ -274,6 +274,14 @@ def test_a_report_says_what_its_numbers_are():
     assert fresh["baseline"]["settling_time [ms]"] == "not within 30"
     assert fresh["tuned"]["residual_rms [µm]"] == "4.4"
     assert "Of links 1 and 3, the controlled ones, the largest value counts" in text
+
+
+def test_a_family_that_keeps_the_limits_comes_before_a_better_one():
+    spec = tuning(GAIN, starts=1, limits={"peak_voltage": 30.0}, families={"loud": {}, "calm": {}})
+    at = begin(spec, SimpleNamespace(linear=None))
+    at = at._replace(best_limits=np.array([[0.1], [0.0]]))
+    judged = [SimpleNamespace(objective=np.array([share])) for share in (0.5, 0.8)]
+    assert best_family(spec, SimpleNamespace(at=at, judged=judged)) == 1
 
 
 @pytest.mark.long

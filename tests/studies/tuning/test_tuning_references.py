@@ -92,6 +92,17 @@ def test_the_gain_factor_alone_is_the_best_feasible_of_all(compared):
     assert scan.best == best[2] and len(set(best)) == 3  # each limit rules out a better one
 
 
+def test_a_gain_factor_beyond_a_limit_is_no_best_one():
+    """Of made-up figures: more gain is better, and above 1 exceeds a limit."""
+
+    def known(spec, runs, values):
+        return 1 / values, np.where(values > 1, 0.1, 0.0)
+
+    with mock.patch.object(references, "_evaluate", known):
+        scan = scan_gain(tuning(FREE, limits={"peak_voltage": 10.0}, starts=1), None)
+    assert scan.gain_factor[scan.best] == 1 < scan.gain_factor[-1]
+
+
 def test_what_is_compared_is_what_its_own_file_gives(compared):
     """On the fresh machines and on the baseline's own; no control is another program here."""
     spec, (own, judged, found), _ = compared

@@ -14,6 +14,7 @@ from studies.study.numbers import one_study
 from studies.study.paths import Parts, set_value
 from studies.study.spec import parse_study
 from studies.tuning import evaluate
+from studies.tuning.check import fresh_columns
 from studies.tuning.evaluate import Evaluator
 from studies.tuning.objective import (
     ScenarioFigures,
@@ -441,6 +442,17 @@ def test_three_values_are_spread_together_on_every_move():
     share = column / own
     np.testing.assert_allclose(share, share[:, :1] * np.ones(3))
     assert 0 < np.abs(share - 1).max() <= 0.05
+
+
+def test_machines_fill_the_whole_spread_and_fresh_ones_are_others():
+    asked = {"count": 20, "check": 20, "spread": {"link.density": 5.0}}
+    spec = tuning(GAIN, scenarios=asked)
+    tuned, fresh = scenario_columns(spec, 20, spec.tune.scenarios.seed), fresh_columns(spec)
+    share = fresh["link.density"] / spec.study.link.density - 1
+    # a Latin hypercube has one in each twentieth of -5 to 5 %
+    assert -0.05 <= share.min() <= -0.045 and 0.045 <= share.max() <= 0.05
+    for name in ("run.seed", "link.density"):
+        assert not np.isin(fresh[name], tuned[name]).any()
 
 
 def test_figures_of_the_loop_need_one():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from types import SimpleNamespace
 
 import jsonschema
 import numpy as np
@@ -222,6 +223,39 @@ def test_a_run_that_ends_with_its_motion_is_refused():
     )
     with pytest.raises(StudyError, match=r"run.duration = .*at least"):
         compare.TwinBench(study, STIFF)
+
+
+def test_runs_are_compared_after_the_reference_trajectory():
+    plan = SimpleNamespace(
+        command_end=0.06, n_samples=1000, electronics=SimpleNamespace(period=1e-4)
+    )
+    assert compare.in_window(plan) == slice(600, 1000)
+
+
+def test_each_change_has_the_differences_without_and_with_control(monkeypatch):
+    """Of made-up runs: the twin's motion is 2 times ours without control, 5 times with it."""
+
+    def signals(size):
+        return compare.RunSignals(*(np.full((4, 3, *more), size) for more in ((), (), (1,))))
+
+    class Bench(SimpleNamespace):
+        def __init__(self, study, settings):
+            plan = SimpleNamespace(
+                command_end=0.0, n_samples=4, n_steps=1, electronics=SimpleNamespace(period=1.0)
+            )
+            super().__init__(study=study, settings=settings, plan=plan)
+
+        def run(self, is_controlled):
+            return signals(5.0 if is_controlled else 2.0)
+
+    monkeypatch.setattr(compare, "TwinBench", Bench)
+    monkeypatch.setattr(compare, "pair", compare.BothModels)
+    study = Study().change(link__modes=compare.MOST_MODES, electronics__adc_noise=1e-4)
+    ours, bench = signals(1.0), Bench(study, STIFF)
+    free, controlled = (compare.BothModels(ours, bench.run(x)) for x in (False, True))
+    found = compare.causes(bench, (ours, ours), compare.BothRuns(free, controlled))
+    assert len(found) == 4
+    np.testing.assert_allclose([x[1:] for x in found], [[0.5, 0.8, 0.8]] * 4)
 
 
 def test_the_command_writes_report_figure_and_numbers(tmp_path, capsys, monkeypatch):
