@@ -337,7 +337,8 @@ def plan(
     """Rounds of tests that execute one of the lines, as many as the budget allows.
 
     Those of files about the module itself come first, then the quickest; one that is too slow for
-    what is left is passed over. Where no test executes any, as of a table that is made on import, those about the module do instead, or any.
+    what is left is passed over. Where no test executes any, as of a table that is made on import,
+    those about the module do instead, or any.
 
     Args:
         seen: tests by file.
