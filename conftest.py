@@ -98,6 +98,12 @@ def _undo(self: pytest.MonkeyPatch) -> None:
     _keep()
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Keep programs again after a test of a user's own parts, which stop it for a process."""
+    _keep()
+
+
 pytest.MonkeyPatch.setattr = _patching("setattr")  # type: ignore[method-assign]
 pytest.MonkeyPatch.setitem = _patching("setitem")  # type: ignore[method-assign]
 pytest.MonkeyPatch.undo = _undo  # type: ignore[method-assign]
