@@ -43,7 +43,8 @@ from tests.tunings import GAIN, tuning
 NOISE = {"electronics": {"adc_noise": 0.002}}
 SPEC = small_spec(**NOISE)
 HALF = small_spec(MIXED | {"blocks": [MIXED["blocks"][0] | {"count": 2}]}, **NOISE)
-CASES = 72
+#: And of each chunk, few enough for four chunks a worker.
+CASES, CHUNK = 72, 8
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -174,7 +175,7 @@ def test_a_chunk_that_fails_costs_no_worker(cluster, tmp_path):
     cluster.trouble(fail=3)
     before = cluster.pids()
     outcome, text = told(cluster, tmp_path / "out")
-    assert outcome.n_run == CASES - 8 and "OSError: no room" in text
+    assert outcome.n_run == CASES - CHUNK and "OSError: no room" in text
     assert cluster.pids() == before
 
 
@@ -338,17 +339,17 @@ def test_a_chunk_that_kills_workers_is_left_out_until_resumed(cluster, local, tm
     cluster.trouble(kill=50)
     out = tmp_path / "out"
     outcome, text = told(cluster, out)
-    assert 50 in outcome.lost and len(outcome.lost) == 16
-    assert outcome.n_run == CASES - 16 and not outcome.is_interrupted
+    assert 50 in outcome.lost and len(outcome.lost) == CHUNK
+    assert outcome.n_run == CASES - CHUNK and not outcome.is_interrupted
     (entry,) = read_manifest(out)["given_up"]
     first, last = map(int, entry["cases"].split("-"))
-    assert first <= 50 <= last == first + 15 and "died" in entry["reason"]
+    assert first <= 50 <= last == first + CHUNK - 1 and "died" in entry["reason"]
     assert f"cases {entry['cases']} are left out" in text
     status = read_sweep(out)["status"]
     np.testing.assert_array_equal(np.flatnonzero(status == NOT_RUN), outcome.lost)
     cluster.trouble()
     again = run_sweep(SPEC, out, True, is_quiet=True)  # here
-    assert again.n_run == 16 and "given_up" not in read_manifest(out)
+    assert again.n_run == CHUNK and "given_up" not in read_manifest(out)
     assert_same(arrays(local), arrays(out), 1e-12)
 
 
