@@ -87,7 +87,6 @@ def central(found):
     return slope, np.maximum(np.abs(slope), 1e-3 * np.abs(slope).max())
 
 
-@pytest.mark.long  # in short: of batched runs in both modes, of tunings
 def test_reverse_and_central_differences_agree(found, central):
     slope, scale = central
     assert np.max(np.abs(found[1][-1] - slope) / scale) < 1e-5
