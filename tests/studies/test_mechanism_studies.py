@@ -26,7 +26,7 @@ from tests import TOP
 GANTRY = TOP / "tests" / "gantry.py"
 SHORT = """
 [run]
-duration = {duration}
+duration = 0.16
 [link]
 modes = 2
 [control]
@@ -59,10 +59,10 @@ def kind(request, gantry):
     return request.param
 
 
-def written(tmp_path, kind, more="", duration=0.2):
+def written(tmp_path, kind, more=""):
     y, end = PLACES[kind]
     path = tmp_path / "study.toml"
-    path.write_text(SHORT.format(kind=kind, y=y, end=end, duration=duration) + more)
+    path.write_text(SHORT.format(kind=kind, y=y, end=end) + more)
     return str(path)
 
 
@@ -75,7 +75,7 @@ link_subsets = "all"
         [0.15, 0.16] if kind == "five_bar" else [0.0, 0.01]
     }
 """
-    main(["sweep", written(tmp_path, kind, more, 0.16), "--out", str(tmp_path / "sweep")])
+    main(["sweep", written(tmp_path, kind, more), "--out", str(tmp_path / "sweep")])
     return tmp_path / "sweep"
 
 
@@ -153,7 +153,7 @@ def test_a_pose_has_as_many_numbers_as_the_platform(capsys):
 
 
 def test_modes_of_two_links_are_named(gantry):
-    study = parse_study(tomllib.loads(SHORT.format(kind=gantry, y=0.14, end=0.15, duration=0.2)))
+    study = parse_study(tomllib.loads(SHORT.format(kind=gantry, y=0.14, end=0.15)))
     modes = studies.machine_modes(study)
     assert modes.link_share.shape[1:] == (2, 2)
     assert np.all(np.isfinite(modes.frequency)) and len(modes.frequency) == 6
