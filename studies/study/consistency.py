@@ -18,6 +18,7 @@ from jaxmodel.mechanisms.contract import Mechanism
 from jaxmodel.piezo import VACUUM_PERMITTIVITY
 from jaxmodel.table import Table
 from studies.errors import StudyError, field_error, nearest, shown
+from studies.study.sizes import default_of
 from studies.study.state_space import check_system
 
 if TYPE_CHECKING:
@@ -101,11 +102,8 @@ def check_mechanism(study: Study) -> None:
     mechanism, machine = study.mechanism, study.machine
     solid = {"platform_inertia"} if mechanism.n_pose == 3 else set()
     read = {"kind", "kinds", "platform_mass", *solid, *mechanism.reads}
-    for leaf, info in type(machine).model_fields.items():
-        value, default = getattr(machine, leaf), info.default
-        if isinstance(default, tuple):
-            default = default[: mechanism.n_links]
-        if leaf not in read and value != default:
+    for leaf, value in machine:
+        if leaf not in read and value != default_of(type(study), mechanism, "machine", leaf):
             raise StudyError(
                 f"machine.{leaf} = {shown(value)}: machine.kind = {mechanism.name!r} has no such "
                 "part; leave it out"
@@ -177,7 +175,7 @@ def _check_damping(study: Study) -> None:
     control = study.control
     for leaf in ("pole_decay", "pole_frequency_hz", "velocity_gain", "position_gain"):
         value = getattr(control, leaf)
-        if value != type(control).model_fields[leaf].default:
+        if value != default_of(type(study), study.mechanism, "control", leaf):
             raise StudyError(
                 f"control.{leaf} = {shown(value)}: control.damping = {shown(control.damping)} "
                 "decides the gains; leave one of them out"

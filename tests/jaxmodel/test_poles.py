@@ -12,6 +12,7 @@ from scipy.linalg import expm
 from jaxmodel.case import Case
 from jaxmodel.laws.contract import acting_channels
 from jaxmodel.laws.poles import _is_flat
+from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.prepare import design_controller
 from jaxmodel.status import OK, UNPLACEABLE
 from studies.engine.controller import fixed_controller
@@ -259,6 +260,15 @@ def test_what_cannot_be_placed_is_a_status(law, changes, code):
 def test_poles_that_make_no_sense_are_refused(control, message):
     with pytest.raises(StudyError, match=message):
         parse_study({"control": control})
+
+
+@pytest.mark.parametrize("kind", MECHANISMS)
+def test_every_mechanism_takes_damping_instead_of_the_gains_that_it_has_by_default(kind):
+    data = {"machine": {"kind": kind}, "control": {"damping": 0.1}}
+    assert parse_study(data).control.damping == 0.1
+    data["control"]["velocity_gain"] = [9.0] * MECHANISMS[kind].n_links
+    with pytest.raises(StudyError, match="velocity_gain.*decides the gains"):
+        parse_study(data)
 
 
 @pytest.mark.parametrize("rate", [4_500.0, 10_000.0, 40_000.0])
