@@ -47,24 +47,6 @@ def euler_force(machine: Machine) -> Array:
     return jnp.broadcast_to(jnp.asarray(force), (machine.n_links,))
 
 
-def loaded_frequency(plant: Plant, axial: Array) -> Array:
-    """Frequencies of links with held ends under axial forces [rad/s], (3, R).
-
-    Args:
-        plant: the machine.
-        axial: N, tension [N], (3,).
-
-    Returns:
-        ascending; 0 for modes that have buckled.
-    """
-    stiffness = plant.stiffness[:, :, None] * jnp.eye(plant.stiffness.shape[1])
-    if plant.shortening is not None:
-        stiffness = stiffness + jnp.asarray(axial)[:, None, None] * chord_slopes(plant)
-    squared = jnp.linalg.eigvalsh(stiffness / plant.modal_mass[:, None, None])
-    is_stable = squared > 0
-    return jnp.where(is_stable, jnp.sqrt(jnp.where(is_stable, squared, 1.0)), 0.0)
-
-
 def chord_slopes(plant: Plant) -> Array:
     """S as a matrix [1/m], (3, R, R): what an axial force of 1 N adds to the stiffness.
 

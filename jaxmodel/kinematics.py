@@ -291,19 +291,3 @@ def lift(plant: Plant, pose: Array) -> Array:
         pose: of the undeformed machine, (3,) [m, m, rad].
     """
     return close_chain(plant, pose, jnp.zeros_like(pose)).near.across / plant.length
-
-
-def closure_residual(chain: Chain, gamma: Array) -> Array:
-    """Residual of (6) [m], (2, 3): C from the platform minus C from slider and bent link.
-
-    Args:
-        chain: supplies C, rho, c and w.
-        gamma: link angles [rad], (3,).
-
-    Returns:
-        components along u and n.
-    """
-    tip = 0.0 if chain.bend.tip is None else chain.bend.tip
-    along = chain.chord * jnp.cos(gamma) - tip * jnp.sin(gamma)
-    across = chain.chord * jnp.sin(gamma) + tip * jnp.cos(gamma)
-    return jnp.stack([chain.near.root - along, chain.near.across - across])

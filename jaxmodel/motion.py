@@ -37,29 +37,6 @@ class PathSample(NamedTuple):
     acceleration: Array
 
 
-def square_path(
-    side: Array = 0.01,
-    move_time: Array = 0.1,
-    dwell: Array = 0.0,
-    phi: Array = np.pi / 6,
-) -> Path:
-    """Return the paper's square (0,0), (0,s), (s,s), (s,0), (0,0) with the cycloid (25).
-
-    Args:
-        side: s, length of a side [m], shape ().
-        move_time: duration of each of the four moves [s], shape () or (4,).
-        dwell: pause after each move [s], shape () or (4,).
-        phi: angle held during the motion [rad], shape ().
-    """
-    x, y = jnp.array([0, 0, 1, 1, 0]), jnp.array([0, 1, 1, 0, 0])
-    return Path(
-        waypoints=jnp.stack([x * side, y * side, jnp.full(5, phi)], axis=1),
-        move_time=jnp.broadcast_to(jnp.asarray(move_time), (4,)),
-        dwell=jnp.broadcast_to(jnp.asarray(dwell), (4,)),
-        profile=jnp.asarray(PROFILES.position("cycloid")),
-    )
-
-
 def move_starts(path: Path) -> Array:
     """Return the start of each move, t_k = sum_{l<k} (tf_l + dwell_l) [s], shape (n,)."""
     ends = jnp.cumsum(path.move_time + path.dwell)

@@ -219,21 +219,6 @@ def design_shaper(kind: Array, omega: Array, zeta: Array, tolerance: Array) -> I
     return Impulses(select(0), select(1))
 
 
-def convolve(first: Impulses, second: Impulses) -> Impulses:
-    """Return two shapers in series, A_i B_j at t_i + s_j, shape (n m,).
-
-    The zeros of both shapers remain, so one shaper per mode serves several modes.
-
-    Args:
-        first: shaper of shape (n,).
-        second: shaper of shape (m,).
-    """
-    return Impulses(
-        jnp.outer(first.amplitude, second.amplitude).ravel(),
-        jnp.add.outer(first.time, second.time).ravel(),
-    )
-
-
 def shaper_duration(impulses: Impulses) -> Array:
     """Return the time of the last impulse with non-zero amplitude, t_n [s], shape ()."""
     return jnp.max(jnp.where(impulses.amplitude != 0, impulses.time, 0))

@@ -57,7 +57,13 @@ def linear_at(structure, case, pose, moment):
 
 close = jax.jit(close_chain)
 axial_force = jax.jit(axial.axial_force)
-loaded_frequency = jax.jit(axial.loaded_frequency)
+
+
+def loaded_frequency(plant, tension):
+    """Frequencies of links with held ends under axial forces [rad/s], (3, R)."""
+    stiffness = plant.stiffness[:, :, None] * np.eye(plant.stiffness.shape[1])
+    stiffness = stiffness + np.asarray(tension)[:, None, None] * axial.chord_slopes(plant)
+    return np.sqrt(np.linalg.eigvalsh(stiffness / plant.modal_mass[:, None, None]))
 
 
 def bending(study, wrench=(0.0, 0.0, 0.0), acceleration=(0.0, 0.0, 0.0)):

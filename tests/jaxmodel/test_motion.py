@@ -13,7 +13,6 @@ from jaxmodel.motion import (
     move_starts,
     sample_path,
     shape_path,
-    square_path,
 )
 from jaxmodel.shaper import SHAPERS, Taps, design_shaper, split_exact
 
@@ -27,6 +26,17 @@ def uneven_path(profile="cycloid"):
         np.array([0.05, 0.1, 0.08]),
         np.array([0.02, 0.0, 0.03]),
         np.asarray(PROFILES.position(profile)),
+    )
+
+
+def square_path(side=0.01, move_time=0.1, dwell=0.0, phi=np.pi / 6):
+    """(0,0), (0,s), (s,s), (s,0), (0,0) with the cycloid (25)."""
+    x, y = np.array([0, 0, 1, 1, 0]), np.array([0, 1, 1, 0, 0])
+    return Path(
+        waypoints=jnp.stack([x * side, y * side, np.full(5, phi)], axis=1),
+        move_time=jnp.broadcast_to(move_time, (4,)),
+        dwell=np.full(4, dwell),
+        profile=np.asarray(PROFILES.position("cycloid")),
     )
 
 

@@ -12,7 +12,6 @@ from jaxmodel.shaper import (
     MAX_IMPULSES,
     SHAPERS,
     Impulses,
-    convolve,
     damped_frequency,
     design_shaper,
     ei,
@@ -215,18 +214,6 @@ def test_duration_ignores_padding():
         np.testing.assert_allclose(got, periods * period, rtol=1e-14)
     late_padding = Impulses(jnp.array([1.0, 0.0]), jnp.array([0.0, 5.0]))
     assert shaper_duration(late_padding) == 0
-
-
-def test_convolution_serves_both_modes():
-    first, second = OMEGA, 4 * OMEGA
-    impulses = convolve(design(1, first, 0.02, 0.05), design(2, second, 0.05, 0.05))
-    assert impulses.amplitude.shape == (MAX_IMPULSES**2,)
-    np.testing.assert_allclose(jnp.sum(impulses.amplitude), 1, rtol=1e-15)
-    assert residual(impulses, first, 0.02) < 1e-15
-    assert residual(impulses, second, 0.05) < 1e-15
-    assert residual(design(1, first, 0.02, 0.05), second, 0.05) > 0.5, "one mode is not enough"
-    alone = shaper_duration(zv(first, 0.02)) + shaper_duration(zvd(second, 0.05))
-    np.testing.assert_allclose(shaper_duration(impulses), alone, rtol=1e-14)
 
 
 def test_exact_split_keeps_the_zero_where_the_linear_split_loses_it():
