@@ -122,6 +122,8 @@ def configure(
         _require_in_force(old_flags, devices, flags)
     _settings().update("jax_enable_x64", precision == "float64")
     global _is_configured
+    if not _is_configured:
+        os.register_at_fork(after_in_child=_note_fork)
     _is_configured = True
     _set_cache(cache)
 
@@ -239,6 +241,13 @@ def cache_folder() -> str:
 
 
 _is_configured = False
+#: Whether this process was forked from one in which JAX had started.
+_is_stranded = False
+
+
+def _note_fork() -> None:
+    global _is_stranded
+    _is_stranded = is_backend_started()
 
 
 def processor() -> str:
@@ -288,11 +297,20 @@ def processor_text() -> str:
 
 
 def require_configured() -> None:
-    """Raise StudyError unless `configure` has been called: JAX's default is single precision."""
+    """Raise StudyError unless `configure` has been called: JAX's default is single precision.
+
+    Nor in a process forked from one in which JAX has started: its threads are not there, and what
+    they were to compute would be waited for without end.
+    """
     if not _is_configured:
         raise StudyError(
             "studies.configure() must be called first, before any JAX operation: it sets double "
             "precision, compiler flags, devices and the compilation cache"
+        )
+    if _is_stranded:
+        raise StudyError(
+            "this process was forked from one in which JAX has started, and would wait for the "
+            'other\'s threads without end; use multiprocessing.get_context("spawn")'
         )
 
 

@@ -86,6 +86,22 @@ def test_equal_settings_may_be_repeated_after_the_start():
     assert os.environ["XLA_FLAGS"] == before
 
 
+def test_a_process_forked_after_the_start_is_refused_with_the_cure():
+    """It would wait for threads that only the other has."""
+    jnp.zeros(1).block_until_ready()
+    config.require_configured()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # JAX and Python say that forking is unsafe
+        child = os.fork()
+    if child == 0:
+        try:
+            config.require_configured()
+        except StudyError as error:
+            os._exit(42 if 'get_context("spawn")' in str(error) else 1)
+        os._exit(2)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 42
+
+
 def test_late_devices_are_refused_with_the_cure():
     count = len(jax.local_devices(backend="cpu"))
     with pytest.raises(StudyError, match=rf"too late.*\(it has {count}\).*restart the kernel"):
