@@ -141,17 +141,39 @@ def test_broken_links_are_found():
 
 
 def test_documents_that_code_names_exist():
-    files = [
-        x
-        for folder in ("jaxmodel", "studies", "tests", "campaigns", ".ci")
-        for x in (TOP / folder).rglob("*")
-    ]
-    texts = {x: x.read_text() for x in files if x.suffix in (".py", ".html", ".toml", ".c", ".h")}
+    folders = ("jaxmodel", "studies", "tests", "campaigns", ".ci")
+    files = [*DOCUMENTS, *(x for folder in folders for x in (TOP / folder).rglob("*"))]
+    texts = {
+        x: x.read_text()
+        for x in files
+        if x.suffix in (".py", ".html", ".toml", ".c", ".h", ".md", ".ipynb")
+    }
     named = {
         (x, name) for x, text in texts.items() for name in re.findall(r"docs/[\w/-]+\.md", text)
     }
     assert len(named) > 10
     assert [x for x in named if not (TOP / x[1]).exists()] == []
+
+
+def found_by(name):
+    """What a dotted name stands for, as a session finds it that has imported its package."""
+    module, *parts = name.split(".")
+    found = importlib.import_module(module)
+    for part in parts:
+        module += f".{part}"
+        found = getattr(found, part) if hasattr(found, part) else importlib.import_module(module)
+    return found
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(TOP)))
+def test_names_in_prose_are_found(path):
+    for name in re.findall(r"`((?:jaxmodel|studies)(?:\.[A-Za-z_]\w*)+)", prose(path)):
+        assert found_by(name) is not None, name
+
+
+def test_a_name_that_fails_as_printed_is_not_found():
+    with pytest.raises(ImportError):
+        found_by("jaxmodel.simulate.simulate")  # jaxmodel.simulate is the function
 
 
 def test_every_page_is_in_the_contents():
