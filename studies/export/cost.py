@@ -25,9 +25,12 @@ class Cost(NamedTuple):
 
     @property
     def text(self) -> str:
+        highest = CLOCK / self.cycles
+        slow = f". CAUTION: it cannot keep up; at this clock up to {highest:.0f} Hz can be sampled"
         return (
             f"{self.products} multiplications a sample, about {self.cycles} cycles: "
             f"{100 * self.load:.0f} % of a sample at {CLOCK / 1e6:.0f} MHz (estimate)"
+            f"{slow if self.load > 1 else ''}"
         )
 
 

@@ -99,9 +99,10 @@ def _of_target(exported: FixedController, target: OnTarget) -> dict[str, Any]:
         return {"instruction_rows": [], "reserved": STACK}
     worst = target.instructions[target.costliest].max()
     rate = exported.study.electronics.sample_rate_hz
+    shares = {clock: target.board.load(worst, rate, clock) for clock in CLOCKS}
     loads = [
-        [f"{clock / 1e6:g} MHz", f"{100 * target.board.load(worst, rate, clock):.0f} %"]
-        for clock in CLOCKS
+        [f"{clock / 1e6:g} MHz", f"{100 * share:.0f} %{', cannot keep up' if share > 1 else ''}"]
+        for clock, share in shares.items()
     ]
     return {"instruction_rows": rows, "worst": worst, "loads": loads, "reserved": STACK}
 

@@ -16,6 +16,7 @@ from studies.export import in_the_loop
 from studies.export.c_fixed import fixed_source
 from studies.export.c_floating import floating_source
 from studies.export.compiler import compiled
+from studies.export.cost import Cost
 from studies.export.fixed import (
     check_error,
     design_fixed,
@@ -204,6 +205,14 @@ def run_of(codes, rms):
     codes, count = np.array(codes)[:, None, None], len(codes)
     result = SimpleNamespace(metrics=SimpleNamespace(residual_rms=np.array(rms)))
     return LoopRun(codes, np.zeros((count, 1, 1)), np.zeros((count, 3)), result)
+
+
+def test_code_that_cannot_keep_up_is_said_with_the_rate_that_can():
+    quick = Cost(products=90, roundings=30, cycles=5000, load=1.0, words=9)
+    assert quick.text.endswith("100 % of a sample at 150 MHz (estimate)")
+    assert (
+        "CAUTION: it cannot keep up; at this clock up to 30000 Hz" in quick._replace(load=1.01).text
+    )
 
 
 def test_deviation_of_a_run():
