@@ -26,7 +26,7 @@ from studies.errors import printable
 from studies.show.units import count_text, headed, number, span
 from studies.study.entries import links_text
 from studies.study.labels import describe
-from studies.study.margin import margin_in_db, robustness_text
+from studies.study.margin import LEFT_OUT, margin_in_db, robustness_text
 from studies.study.spec import Study
 from studies.study.template import study_template
 
@@ -105,6 +105,7 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
     )
     environment.filters.update(FILTERS)
+    environment.globals["left_out"] = LEFT_OUT
     return environment
 
 

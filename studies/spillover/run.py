@@ -34,6 +34,7 @@ from studies.spillover.report import (
 )
 from studies.store import Variable, write_store
 from studies.study.labels import STATUS_LABEL
+from studies.study.margin import LEFT_OUT
 from studies.study.spec import Study
 
 DOCUMENT, DATA = "certificate.json", "spillover.h5"
@@ -95,7 +96,7 @@ def spillover_design(
             write_store(staging / DATA, variables(certificate), run_attributes(study))
             (staging / DOCUMENT).write_text(document(certificate), encoding="utf-8")
             (staging / REPORT).write_text(report(certificate, staging), encoding="utf-8")
-    for note in certificate.notes:
+    for note in (*certificate.notes, LEFT_OUT):
         console.print(note, soft_wrap=True)
     announce(console, out / REPORT, ", data and figures in the same folder")
     return certificate

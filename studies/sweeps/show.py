@@ -30,7 +30,7 @@ from studies.errors import ResolutionWarning, StudyError, field_error
 from studies.show.listing import Rows, print_rows
 from studies.show.units import headed, readable, settling_text
 from studies.study.entries import links_text
-from studies.study.margin import ENOUGH, margin_text
+from studies.study.margin import ENOUGH, LEFT_OUT, margin_text
 from studies.study.resolution import is_deflection, least_step, resolution_text
 from studies.sweeps.environments import (
     design_values,
@@ -206,6 +206,8 @@ def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console:
     note = mark_note(data, cases, metrics[0])
     if note:
         console.print(note, soft_wrap=True)
+    if MARGIN in data.variables:
+        console.print(LEFT_OUT, soft_wrap=True)
     for warning in (margin_warning(data, cases), resolution_warning(data, cases, metrics[0])):
         if warning:
             console.print(f"[bold red]{escape(warning)}[/]", soft_wrap=True, markup=True)

@@ -18,6 +18,7 @@ from studies.show.listing import Rows, print_rows
 from studies.space.indices import elementary_effects, sobol_indices
 from studies.space.table import build_table
 from studies.store import Variable
+from studies.study.margin import LEFT_OUT
 from studies.sweeps.dry_run import axis_rows
 from studies.sweeps.explore import _figure
 from studies.sweeps.plots import front
@@ -31,6 +32,7 @@ from studies.sweeps.show import (
     counted_text,
     label,
     margin_warning,
+    print_cases,
     ranked_cases,
     requirement,
     status_rows,
@@ -289,6 +291,15 @@ def test_small_margins_are_counted():
     at_it = usual(gain_margin=np.full(8, 2.0))
     assert requirement(at_it, "residual_rms") == "gain_margin >= 2"
     assert margin_warning(at_it, np.arange(8)) == ""
+
+
+def test_margins_are_shown_with_what_they_leave_out(capsys):
+    data, shown = usual(), []
+    without = {x: y for x, y in data.variables.items() if x != "gain_margin"}
+    for variables in (data.variables, without):
+        print_cases(replace(data, variables=variables), np.array([0]), ["residual_rms"], Console())
+        shown.append(" ".join(capsys.readouterr().out.split()))
+    assert LEFT_OUT in shown[0] and LEFT_OUT not in shown[1]
 
 
 # --- failures -------------------------------------------------------------------------------------
