@@ -30,7 +30,6 @@ class Search(NamedTuple):
 
     undecided: Cells
     evaluated: int  # cells
-    is_complete: bool  # otherwise the work was used up
 
 
 def exclude_zeros(
@@ -56,7 +55,7 @@ def exclude_zeros(
     evaluated = 0
     while stack:
         if evaluated >= most or is_over():
-            return Search(_joined(stack + left, cells), evaluated, False)
+            return Search(_joined(stack + left, cells), evaluated)
         now = stack.pop()
         if len(now.low) > CHUNK:
             stack.append(Cells(now.low[CHUNK:], now.high[CHUNK:]))
@@ -71,14 +70,14 @@ def exclude_zeros(
         if is_final.any():
             left.append(Cells(still.low[is_final], still.high[is_final]))
             if stops_at_first:
-                return Search(_joined(left, cells), evaluated, True)
+                return Search(_joined(left, cells), evaluated)
         if not is_final.all():
             halves = _halved(Cells(still.low[~is_final], still.high[~is_final]), along[~is_final])
             # small leftovers are joined, so that chunks stay full
             if stack and len(stack[-1].low) < CHUNK:
                 halves = _joined([stack.pop(), halves], cells)
             stack.append(halves)
-    return Search(_joined(left, cells), evaluated, True)
+    return Search(_joined(left, cells), evaluated)
 
 
 def _judge(setup: Exclusion, cells: Cells, smallest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -90,33 +90,17 @@ def _export(measured: MeasuredSpec, out: Path, console: Console) -> None:
 
 #: In their order.
 STAGES = (
+    Stage("fit", "fit the model to the measurements", REPORT, (f"fit/{DOCUMENT}",), _fit),
+    Stage("tune", "tune on machines that the data leave possible", REPORT, (DESIGN,), _tune),
     Stage(
-        name="fit",
-        text="fit the model to the measurements",
-        page=REPORT,
-        last=(f"fit/{DOCUMENT}",),
-        make=_fit,
+        *("certificate", "certify on plants that differ from the model", REPORT),
+        (f"certificate/{CERTIFICATE}",),
+        _certify,
     ),
     Stage(
-        name="tune",
-        text="tune on machines that the data leave possible",
-        page=REPORT,
-        last=(DESIGN,),
-        make=_tune,
-    ),
-    Stage(
-        name="certificate",
-        text="certify on plants that differ from the model",
-        page=REPORT,
-        last=(f"certificate/{CERTIFICATE}",),
-        make=_certify,
-    ),
-    Stage(
-        name="firmware",
-        text="export, compare, emulate",
-        page=VERIFICATION,
-        last=(f"firmware/{VERIFICATION}", f"firmware/{FAILED}"),
-        make=_export,
+        *("firmware", "export, compare, emulate", VERIFICATION),
+        (f"firmware/{VERIFICATION}", f"firmware/{FAILED}"),
+        _export,
     ),
 )
 

@@ -13,6 +13,7 @@ import numpy as np
 from jaxmodel.pairs import Pair
 from jaxmodel.pole_paths import OrderPoles, refine_closed_loop_poles, refine_open_loop_poles
 from jaxmodel.return_difference import AssembledModes, LoopResponse
+from studies.engine.host_loop import link_poles
 from studies.engine.lanes import run_steps
 
 #: Iterations to find the poles without control.
@@ -27,6 +28,12 @@ WAYS = (
 AT_REST = 1e-4
 #: Initial distance of poles from one another and from poles of the function [1].
 ASIDE = 1e-4
+#: Energy share of an order in its undamped modes from which they are its poles' neighbours [1].
+#: Below it, the drives' damping decides which of the modes are the links'.
+CLEAR = 0.9
+#: Share of an order in the energy of its undamped modes above which its poles are beside them;
+#: below it, drives are as quick as the links, and damping decides which of the modes are theirs.
+CLEAR = 0.9
 #: In which directions [rad].
 ANGLES = (0.3, 2.4, 4.4)
 
@@ -45,10 +52,9 @@ def damping_ratios(
         n_links: controlled ones of each case, (n,).
         n_orders: number of mode orders.
     """
-    count = len(n_links)
-    ratios = np.full((count, n_orders), np.nan)
-    for order in range(min(n_orders, response.square.shape[1])):
-        poles = _poles(response, modes, order)
+    ratios = np.full((len(n_links), n_orders), np.nan)
+    for order, first in enumerate(_open_loop_poles(response, modes, n_orders)):
+        poles = _poles(response, order, first)
         ratios[:, order] = least_controlled(-poles.real / np.abs(poles), n_links)
     return ratios
 
@@ -65,13 +71,52 @@ def least_controlled(ratio: np.ndarray, n_links: np.ndarray) -> np.ndarray:
     return np.where(n_links > 0, least, np.nan)
 
 
-def _poles(response: LoopResponse, modes: AssembledModes, order: int) -> np.ndarray:
+def _open_loop_poles(
+    response: LoopResponse, modes: AssembledModes, n_orders: int
+) -> list[np.ndarray]:
+    """About the poles of each order without control [1/s], NaN if overdamped, (l, n) each."""
+    n_links, found = len(response.square), []
+    is_clear = np.ones(response.square.shape[2], bool)
+    for order in range(min(n_orders, response.square.shape[1])):
+        share = modes.share[order + 1]
+        which = np.argsort(-share, axis=0)[:n_links]
+        omega, loss, share = (
+            np.take_along_axis(x, which, axis=0) for x in (modes.omega, modes.decay, share)
+        )
+        found.append(-loss + 1j * np.sqrt(omega**2 - loss**2))
+        is_clear &= share.min(axis=0) > CLEAR
+    for k in np.flatnonzero(~is_clear & np.isfinite(modes.omega).all(axis=0)):
+        each = link_poles(_state(response, k), n_links, len(found))
+        for poles, own in zip(found, each, strict=True):
+            poles[:, k] = own
+    return found
+
+
+def _state(response: LoopResponse, k: Any) -> np.ndarray:
+    """A of the plant of lane k in (X, X', q, q'), by the equations of `assembled_modes`."""
+    response = jax.tree.map(lambda x: x[..., k], response)
+    enter, leave = (np.concatenate(x, axis=1) for x in (response.enter, response.leave))
+    drag = np.sign(leave) * np.sqrt(np.maximum(enter * leave, 0.0))
+    pose, modes = drag.shape
+    n, none = pose + modes, np.zeros_like(drag)
+    mass = np.block([[response.mass, drag], [drag.T, np.eye(modes)]])
+
+    def per_mass(own: np.ndarray, links: np.ndarray) -> np.ndarray:
+        whole = np.block([[own, none], [none.T, np.diag(np.ravel(links))]])
+        return np.asarray(np.linalg.solve(mass, whole))
+
+    stiffness = per_mass(response.stiffness, response.square)
+    damping = per_mass(response.damping, response.decay)
+    state = np.block([[np.zeros((n, n)), np.eye(n)], [-stiffness, -damping]])
+    order = np.r_[:pose, n : n + pose, pose:n, n + pose : 2 * n]
+    return state[np.ix_(order, order)]
+
+
+def _poles(response: LoopResponse, order: int, guess: np.ndarray) -> np.ndarray:
     """The poles of an order [1/s], complex, NaN where they were not found, (l, n)."""
     square, decay = response.square[:, order], response.decay[:, order] / 2
     held = _pair(-decay + 1j * np.sqrt(square - decay**2))
-    which = np.argsort(-modes.share[order + 1], axis=0)[: len(square)]
-    omega, loss = (np.take_along_axis(x, which, axis=0) for x in (modes.omega, modes.decay))
-    first = _poles_apart(-loss + 1j * np.sqrt(omega**2 - loss**2), response.period)
+    first = _poles_apart(guess, response.period)
     own = run_steps(_refine_open_loop_poles, (response, held), (), first, SETTLING).pole
     poles, is_found = _follow(response, own, WAYS[0])
     again = np.flatnonzero(~is_found)

@@ -56,30 +56,36 @@ def sampled_loop(
 
 
 def link_poles(state: np.ndarray, n_links: int, n_tracked: int) -> np.ndarray:
-    """Poles [rad/s] of the uncontrolled link modes, by ascending frequency, (J, n_links).
+    """Poles [rad/s] of the uncontrolled link modes, by order, then ascending, (J, n_links).
 
-    These are the eigenvalues whose eigenvectors lie mainly in the modal coordinates; overdamped
-    modes have no such pole: NaN.
+    A pole belongs to the order of modes, or to the pose on its drives, that takes part in its
+    eigenvector most, by participation factors as in `name_motion`; of all ways to give each pole
+    one place, the one with the largest sum. An order of which a mode is overdamped, and so has no
+    such pole, is NaN.
 
     Args:
         state: A of the plant, `LoopMatrices.plant`.
         n_links: as many as the pose has coordinates.
         n_tracked: J.
     """
-    pose = n_links
-    modes = state.shape[0] // 2 - pose
-    value, vector = np.linalg.eig(state)
+    from scipy.linalg import eig
+    from scipy.optimize import linear_sum_assignment  # they take a quarter of a second
+
+    value, left, right = eig(state, left=True)
     upper = value.imag > 0
-    vector, value = vector[:, upper], value[upper]
-    bending = np.abs(vector[2 * pose : 2 * pose + modes])
-    weight = np.abs(vector[:pose]).max(axis=0) / bending.max(axis=0)
-    # at most as many pairs belong to the pose on its drive: those with the largest pose share
-    n_rigid = value.size - modes
-    flexible = np.sort_complex(1j * value[np.argsort(weight)[: value.size - max(n_rigid, 0)]])
-    flexible = flexible[np.argsort(np.abs(flexible))] / 1j
-    kept = min(flexible.size // n_links, n_tracked)
+    value, factor = value[upper], (left.conj() * right)[:, upper]
+    factor = (factor / factor.sum(axis=0)).real
+    pose, bending = factor[: 2 * n_links], factor[2 * n_links :]
+    orders = bending.reshape(2, n_links, -1, value.size).sum(axis=(0, 1))
+    share = np.vstack([pose.sum(axis=0), orders])
+    place = np.repeat(np.arange(len(share)), n_links)
+    which, at = linear_sum_assignment(share[place].T, maximize=True)
+    order = np.full(value.size, -1)
+    order[which] = place[at] - 1
     poles = np.full((n_tracked, n_links), np.nan, complex)
-    poles[:kept] = flexible[: n_links * kept].reshape(kept, n_links)
+    for j in range(n_tracked):
+        if np.sum(order == j) == n_links:
+            poles[j] = sorted(value[order == j], key=abs)
     return poles
 
 

@@ -233,42 +233,6 @@ def by_lagrangian(machine: Machine, basis: ModalBasis, motion: RigidState, loads
     return split(jnp.linalg.solve(mass, load - inertial))
 
 
-def by_multipliers(machine: Machine, basis: ModalBasis, motion: RigidState, loads: Loads) -> Any:
-    """(X'', q'', rho'', beta'') from (5): coordinates (rho, beta, X, q), constraints (6)."""
-    shape, n = motion.q.shape, len(motion.pose)
-
-    def split(y: Any) -> Any:
-        return y[:n], y[n : 2 * n], y[2 * n : 3 * n], y[3 * n :].reshape(shape)
-
-    def constraints(y: Any) -> Any:
-        rho, beta, pose, q = split(y)
-        tips = link_tips(machine, basis, rho, beta, q)
-        return (tips - platform_joints(machine.geometry, pose)).ravel()
-
-    def energy(y: Any, y_rate: Any) -> Any:
-        rho, beta, pose, q = split(y)
-        rho_rate, beta_rate, pose_rate, q_rate = split(y_rate)
-        joints, rates = (rho, beta), (rho_rate, beta_rate)
-        return kinetic_energy(machine, basis, joints, pose, q, rates, pose_rate, q_rate)
-
-    def all_coordinates(z: Any) -> Any:
-        pose, q = z
-        return jnp.concatenate([*close(machine, basis, pose, q), pose, q.ravel()])
-
-    y, y_rate = jax.jvp(
-        all_coordinates, ((motion.pose, motion.q),), ((motion.pose_rate, motion.q_rate),)
-    )
-    mass, inertial = inertia(energy, y, y_rate)
-    on_modes = modal_load(machine, basis, motion.q, motion.q_rate, loads.modal)
-    load = jnp.concatenate([loads.slider, jnp.zeros(2 * n), on_modes.ravel()])
-    jacobian = jax.jacfwd(constraints)(y)
-    curvature = jax.jvp(lambda y: jax.jvp(constraints, (y,), (y_rate,))[1], (y,), (y_rate,))[1]
-    system = jnp.block([[mass, jacobian.T], [jacobian, jnp.zeros((2 * n, 2 * n))]])
-    solution = jnp.linalg.solve(system, jnp.concatenate([load - inertial, -curvature]))
-    rho_acc, beta_acc, pose_acc, q_acc = split(solution[: y.size])
-    return pose_acc, q_acc, rho_acc, beta_acc
-
-
 def rk4_step(derivative: Any, state: Any, step: Any, inputs: Any) -> Any:
     """One classical Runge-Kutta step; `inputs` at start, middle and end."""
 

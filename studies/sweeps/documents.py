@@ -29,6 +29,7 @@ from studies.sweeps.show import (
     ranking,
     requirement,
     resolution_warning,
+    unranked_text,
 )
 
 
@@ -66,7 +67,8 @@ def best_document(data: SweepData, by: str, subject_to: str = "", count: int = 1
     """What `studies best` says; arguments and errors as `best_cases`."""
     name = by.removeprefix("-")
     cases, metrics = ranked_cases(data, by, subject_to, count), with_others(data, [name])
-    warnings = margin_warning(data, cases), resolution_warning(data, cases, name)
+    warnings = [margin_warning(data, cases), resolution_warning(data, cases, name)]
+    warnings.append(unranked_text(data, name))
     return {
         "by": name,
         "direction": direction(by),

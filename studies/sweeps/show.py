@@ -28,7 +28,7 @@ from studies.engine.results import (
 from studies.engine.stored import kept_metrics
 from studies.errors import ResolutionWarning, StudyError, field_error
 from studies.show.listing import Rows, print_rows
-from studies.show.units import headed, readable, settling_text
+from studies.show.units import count_text, headed, readable, settling_text
 from studies.study.entries import links_text
 from studies.study.margin import ENOUGH, LEFT_OUT, margin_text
 from studies.study.resolution import is_deflection, least_step, resolution_text
@@ -208,7 +208,8 @@ def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console:
         console.print(note, soft_wrap=True)
     if MARGIN in data.variables:
         console.print(LEFT_OUT, soft_wrap=True)
-    for warning in (margin_warning(data, cases), resolution_warning(data, cases, metrics[0])):
+    texts = margin_warning(data, cases), resolution_warning(data, cases, metrics[0])
+    for warning in (*texts, unranked_text(data, metrics[0])):
         if warning:
             console.print(f"[bold red]{escape(warning)}[/]", soft_wrap=True, markup=True)
 
@@ -268,6 +269,16 @@ def _step_share(data: SweepData) -> np.ndarray:
     )
     share = full / own.adc_range * 2.0 ** (own.adc_bits - bits) * own.conditioner_gain / gain
     return np.asarray(share)
+
+
+def unranked_text(data: SweepData, by: str) -> str:
+    """How many cases a ranking leaves out though they are ok, "" if none."""
+    is_ok = data["status"] == status.OK
+    missing = is_ok & ~np.isfinite(metric_values(data, by))
+    if not missing.any():
+        return ""
+    count = count_text(int(missing.sum()), "case")
+    return f"{count} of {is_ok.sum():,} with status ok without {by}: not ranked"
 
 
 def margin_warning(data: SweepData, cases: np.ndarray) -> str:

@@ -18,6 +18,7 @@ from jaxmodel.return_difference import (
     evaluate_loop_gain,
 )
 from studies.engine import lanes
+from studies.engine.damping import least_controlled
 from studies.engine.eigenvalues import eigenvalues
 from studies.engine.lanes import BLOCK
 from studies.engine.margins import LEAST_DAMPED, _respond, judge_loops
@@ -274,6 +275,38 @@ def test_damping_ratio_follows_the_modes():
     one = single_damping(STUDY.change(control__links=(False, True, False)))
     assert np.all(np.abs(one / found - 1) < 0.3)  # of the link under control, not of the others
     assert np.isnan(single_damping(STUDY.change(control__links=(False, False, False)))).all()
+
+
+#: Of steel: the drives' own modes, 33 to 46 Hz and well damped, beside the first bending modes.
+STEEL = STUDY.change(
+    machine__platform_mass=0.6,
+    link__length=0.28,
+    link__thickness=1.5e-3,
+    link__width=20e-3,
+    link__density=7850.0,
+    link__youngs_modulus=200e9,
+    patches__centers=(0.04, 0.12, 0.21),
+    patches__width=20e-3,
+)
+
+
+def test_modes_are_told_from_drives_as_quick_as_they():
+    structure, case = build_structure(STEEL), as_arrays(build_case(STEEL))
+    loop = loop_report(structure, case, HOME)
+    spans = [(43.0, 47.0), (175.0, 180.0), (394.0, 396.0)]
+    for frequency, (low, high) in zip(loop.frequency_hz, spans, strict=True):
+        assert np.all((frequency > low) & (frequency < high))
+    assert loop.damping_ratio[0].max() < 0.28  # the drives' are 0.29 to 0.43
+    poles = exact_poles(Loops(structure, jax.tree.map(lambda x: np.asarray(x)[None], case)))[0]
+    for frequency, ratio in zip(loop.frequency_hz.ravel(), loop.damping_ratio.ravel(), strict=True):
+        pole = 2 * np.pi * frequency * (-ratio + 1j * np.sqrt(1 - ratio**2))
+        assert np.nanmin(np.abs(poles - pole)) < 1e-3 * abs(pole)
+    for gain, links in ((1.0, (True, True, True)), (0.5, (False, True, False))):
+        study = STEEL.change(control__gain_factor=gain, control__links=links)
+        case = as_arrays(build_case(study))
+        wanted = loop_report(structure, case, HOME).damping_ratio
+        least = least_controlled(wanted.T, np.full(3, sum(links)))
+        np.testing.assert_allclose(single_damping(study), least, rtol=2e-3)
 
 
 def single_damping(study):

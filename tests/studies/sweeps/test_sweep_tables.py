@@ -19,6 +19,7 @@ from studies.space.indices import elementary_effects, sobol_indices
 from studies.space.table import build_table
 from studies.store import Variable
 from studies.study.margin import LEFT_OUT
+from studies.sweeps.documents import best_document
 from studies.sweeps.dry_run import axis_rows
 from studies.sweeps.explore import _figure
 from studies.sweeps.plots import front
@@ -37,6 +38,7 @@ from studies.sweeps.show import (
     requirement,
     status_rows,
     uncontrolled_text,
+    unranked_text,
 )
 from tests.pages import tables_of, text_of
 from tests.studies.test_cli import run
@@ -291,6 +293,15 @@ def test_small_margins_are_counted():
     at_it = usual(gain_margin=np.full(8, 2.0))
     assert requirement(at_it, "residual_rms") == "gain_margin >= 2"
     assert margin_warning(at_it, np.arange(8)) == ""
+
+
+def test_cases_that_cannot_be_ranked_are_counted():
+    margin = np.array([3.0, np.nan, np.nan, 2.5, 2.5, np.nan, 4.0, 4.0])
+    data = usual(codes=[0, 0, 0, 5, 5, 3, 0, 0], gain_margin=margin)
+    text = unranked_text(data, "gain_margin")
+    assert text == "2 cases of 5 with status ok without gain_margin: not ranked"
+    assert best_document(data, "gain_margin")["warnings"][-1] == text
+    assert unranked_text(data, "residual_rms") == ""
 
 
 def test_margins_are_shown_with_what_they_leave_out(capsys):
