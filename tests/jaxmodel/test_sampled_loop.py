@@ -168,6 +168,9 @@ def test_gain_margin_stops_at_the_first_unstable_gap():
         return np.array([0.5, 1.5 if 2 < factor < 3 else 0.9])
 
     np.testing.assert_allclose(gain_margin(poles), 2, rtol=1e-4)
+    # no factor to start with is left out
+    found = gain_margin(lambda factor: poles(4 * factor), np.array([0.2, 0.6, 1.0]))
+    np.testing.assert_allclose(found, 0.5, rtol=1e-4)
 
 
 def test_gain_margin_of_known_poles():

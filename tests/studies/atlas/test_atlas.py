@@ -15,6 +15,7 @@ from rich.console import Console
 
 from studies.atlas import attribution, claims, figures, findings, platform, run, subsets, workspace
 from studies.atlas.platform import LINK_SETS, platform_error, responses
+from studies.atlas.report import _runs
 from studies.engine.modes import machine_modes
 from studies.engine.results import read_sweep
 from studies.engine.runs import run_study
@@ -269,6 +270,27 @@ def test_claims_are_counted():
     assert np.all(signs.agree[:, signs.is_controlled])
     np.testing.assert_allclose(signs.ours[0][signs.is_controlled], -0.75)
     np.testing.assert_allclose(signs.ours[0][~signs.is_controlled], 0.0)
+
+
+def test_a_report_says_what_control_of_all_links_changes():
+    """From no control to that of all, the last of the choices."""
+    vibration = np.ones((2, 4, 5, 3))
+    vibration[0, -1], vibration[1, -1] = (0.8, 0.8, 0.7), (1.1, 1.1, 1.0)
+    runs = platform.PlatformError(
+        time=np.arange(5.0),
+        command_end=np.zeros(2),
+        window=np.ones((2, 5)),
+        drive=np.stack([np.full((5, 3), 0.5), np.full((5, 3), 2.0)]),
+        vibration=vibration,
+        pose=vibration,
+        modal=vibration[..., None],
+    )
+    found = _runs(mock.Mock(platform=runs))
+    assert [(x["centre"], x["turn"]) for x in found] == [
+        ("-20.0 %", "-30.0 %"),
+        ("+10.0 %", "0.0 %"),
+    ]
+    assert [x["is_drive"] for x in found] == [False, True]
 
 
 @pytest.mark.parametrize(

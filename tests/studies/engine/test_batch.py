@@ -1,5 +1,8 @@
 """A batch is its members: vmap equals single runs, no member touches another, one compilation."""
 
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+
 import jax
 import numpy as np
 import pytest
@@ -7,6 +10,7 @@ import pytest
 from jaxmodel import status
 from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import simulate
+from studies.engine.executor import Differentiated
 from studies.engine.runs import _simulate
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import paper_study
@@ -54,6 +58,24 @@ def mixed_case(rng):
             control=case.control._replace(n_active=float(rng.integers(1, 4))),
         )
     )
+
+
+def test_gradients_of_several_numbers_are_those_of_their_own_metrics():
+    """Cases differ in how many numbers they have a part in, and one has failed."""
+    slope = np.random.default_rng(0).normal(size=(2, 4, 3))  # of metrics, by case
+
+    def pull_back(part):
+        return lambda weights: sum(x[..., None] * slope[k, part] for k, x in enumerate(weights))
+
+    weights = np.zeros((2, 3, 4))
+    weights[0, 0], weights[1, 1, 1:], weights[:, 2, 2] = 2.0, [3.0, 4.0, 5.0], [6.0, 7.0]
+    failed = SimpleNamespace(status=np.array([0, 0, 0, status.NON_FINITE]))
+    with ThreadPoolExecutor(2) as pool:
+        parts = [pull_back(slice(0, 2)), pull_back(slice(2, 4))]
+        found = Differentiated(failed, parts, 3, pool).pull_back(tuple(weights))
+    wanted = np.einsum("knc,kcp->ncp", weights, slope)
+    wanted[:, 3] = 0.0
+    np.testing.assert_allclose(found, wanted, atol=1e-14)
 
 
 @pytest.fixture(scope="module")

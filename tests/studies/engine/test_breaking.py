@@ -14,7 +14,7 @@ from jaxmodel.sampled_loop import analogue_plant, closed_loop
 from studies.engine import breaking
 from studies.engine.breaking import TOLERANCES, parse_tolerances, smallest_change
 from studies.engine.controller import fixed_controller
-from studies.engine.nearest import Loops, growth, nearest_unstable
+from studies.engine.nearest import Loops, _pulled, growth, nearest_unstable
 from studies.errors import StudyError
 from studies.show.document import plain, schema
 from studies.study.cases import as_arrays, build_case, build_structure
@@ -244,6 +244,15 @@ def test_of_channels_that_act_one_at_a_time_the_first_to_break_counts(design, fo
     monkeypatch.setattr(breaking, "linear_parts", lambda law: [(slice(None), law)] * 3)
     monkeypatch.setattr(breaking, "nearest_unstable", lambda loops: next(limits))
     assert smallest_change(design.fixed).text == found.text
+
+
+@pytest.mark.parametrize(("below", "wanted"), [(0.5, 0.45), (1.2, 0.45), (0.4, None)])
+def test_of_two_limits_on_a_ray_the_nearer_one_counts(below, wanted):
+    """Unstable from 0.45 to 1.5 alone."""
+    limit = np.array([3.0])
+    loops = Loops(lambda x: np.eye(1) * (1 + (x - 0.45) * (1.5 - x)), None, -limit, limit)
+    found = _pulled(loops, np.ones(1), below)
+    assert found is None if wanted is None else found == pytest.approx(wanted, rel=1e-3)
 
 
 def shell(design, distance, count, rng):

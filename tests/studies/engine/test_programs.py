@@ -1,5 +1,6 @@
 """Programs kept on disk: found without being traced, and never mistaken for another."""
 
+import runpy
 import shutil
 
 import jax
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxmodel.case import Structure
-from studies import sources
+from studies import config, sources
 from studies.engine import programs
 from studies.engine.programs import kept_data, kept_jit
 from studies.kernels import compilation
@@ -150,6 +151,7 @@ def test_only_commands_keep_programs(tmp_path, monkeypatch):
     """A session of Python may change a module by hand, which no name would tell."""
     monkeypatch.setattr(compilation, "cache_folder", lambda: str(tmp_path))
     assert not programs.is_keeping()
+    assert not runpy.run_path(config.__file__)["is_keeping"]()  # as it is before these tests
     scaled(Structure(n_modes=5), np.ones(2), 1.0)
     assert kept_data(["numbers"], lambda: 3, __name__) == 3
     assert not list(tmp_path.iterdir())

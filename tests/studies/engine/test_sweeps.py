@@ -5,6 +5,7 @@ import os
 import resource
 import shutil
 import signal
+import stat
 import subprocess
 import sys
 import threading
@@ -20,15 +21,23 @@ from rich.console import Console
 
 import studies
 from jaxmodel import status
-from studies.engine import function
+from studies.engine import function, plan
 from studies.engine import sweep as run_module
 from studies.engine.design import deviation, load_design
-from studies.engine.folder import CHUNKS, finished_cases, make_manifest, open_folder
+from studies.engine.folder import (
+    CHUNKS,
+    SweepFolder,
+    finished_cases,
+    make_manifest,
+    open_folder,
+)
 from studies.engine.function import TRACES
 from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import run_study
 from studies.engine.sweep import make_plan, run_sweep
 from studies.errors import StudyError
+from studies.space.table import build_table
+from studies.study.cases import build_structure
 from studies.sweeps.show import case_rows, margin_warning, ranked_cases
 from tests import TOP
 from tests.sweeps import FAST_MOVE, MIXED, narrow_blocks, small, small_spec
@@ -300,6 +309,35 @@ def test_a_killed_sweep_runs_only_what_is_left(tmp_path, mixed):
     outcome = run(noisy_spec(), out, is_resumed=True)
     assert outcome.n_done == 72 and outcome.n_run == 72 - len(done)
     assert_same(arrays(mixed[0]), arrays(out))
+
+
+def test_the_fastest_pole_of_every_case_sets_its_plant_steps(monkeypatch):
+    """Of more cases than are looked at together; one that has no poles counts as 0."""
+    table = build_table(small_spec({"axes": {"gain": np.linspace(0.1, 0.4, 300).tolist()}}))
+    gain = table.values("control.gain_factor")
+
+    def made_up(structure, cases):
+        rate = np.where(cases.control.gain_factor == gain[7], np.nan, cases.control.gain_factor)
+        slow, fast = -rate * np.array([[[1.0]], [[100.0]]])
+        return np.stack([slow, fast], axis=-1).swapaxes(0, 1)[..., None] * np.eye(2)
+
+    monkeypatch.setattr(plan, "_mechanics", made_up)
+    members = np.arange(300)[::-1]
+    found = plan._pole_decay(table, build_structure(table.study), members)
+    np.testing.assert_allclose(found, np.where(members == 7, 0.0, 100 * gain[members]))
+
+
+def test_a_chunk_outlives_a_loss_of_power(tmp_path, monkeypatch):
+    """It is on the disk before it has its name, and then its name is."""
+    flushed = []
+
+    def fsync(descriptor):
+        is_folder = stat.S_ISDIR(os.fstat(descriptor).st_mode)
+        flushed.append((is_folder, len(list(tmp_path.glob("chunks/*.h5")))))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    SweepFolder(tmp_path).write_chunk({"status": np.zeros(2)})
+    assert flushed == [(False, 0), (True, 1)]
 
 
 def partly_done(out, spec=None, number=signal.SIGINT):

@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
@@ -140,6 +141,17 @@ def test_a_controller_on_a_processor(capsys, study, target, board, tmp_path):
             r"shaper, the case's motion \| 0 counts differ",
         ):
             assert re.search(f"{board}: {line}", words)
+
+
+def test_routines_that_fixed_point_must_not_call_are_named():
+    at = SimpleNamespace(board=SimpleNamespace(name="M3"), is_fixed=True)
+    found = [
+        on_target._static_checks(at, SimpleNamespace(stack=100, soft_float=names))[-1]
+        for names in ([], ["__aeabi_dmul", "__aeabi_dadd"])
+    ]
+    what = "M3: calls of floating-point routines"
+    assert found[0] == (what, "none", "none", True)
+    assert found[1] == (what, "__aeabi_dmul, __aeabi_dadd", "none", False)
 
 
 @pytest.mark.long  # in short: the first board and 24,000 samples of each export

@@ -9,9 +9,12 @@ from scipy.stats import chi2, norm
 from studies.fitting.kinds.contract import Residual
 from studies.fitting.problem import Problem
 from studies.fitting.profiles import Likelihood, describe_confirmed, profile
-from studies.fitting.report import _misfit, _others
+from studies.fitting.report import _misfit, _others, value_rows
 from studies.fitting.solve import Solution
 from studies.fitting.statistics import UNKNOWN, describe_fit, misfit, spread
+from studies.space.axes import Range
+from studies.space.free import Free as FreeNumber
+from studies.space.free import FreeNumbers
 
 LOW, SPAN = np.array([10.0, -2.0]), np.array([20.0, 8.0])
 
@@ -80,6 +83,28 @@ def test_an_interval_ends_at_the_bounds():
     np.testing.assert_allclose(found.interval, [[10.0, 30.0]])
     np.testing.assert_allclose(found.sigma, SPAN[:1] / np.sqrt(12))
     assert len(found.undetermined) == 1 and pytest.approx(12**-0.5) == UNKNOWN
+
+
+def test_a_number_of_which_only_the_bounds_are_known_is_not_identifiable():
+    """Whatever the distance between them."""
+    spans = {"wide": Range(0.0, 2e10, 0, False), "narrow": Range(0.0, 0.04, 0, False)}
+    free = FreeNumbers(
+        tuple(FreeNumber(name, span, np.nan, name) for name, span in spans.items()), lambda *_: None
+    )
+    width = np.array([2e10, 0.04])
+    for share, said in ((UNKNOWN, "not identifiable"), (0.9 * UNKNOWN, "")):
+        answer = SimpleNamespace(
+            values=width / 2, sigma=share * width, interval=np.outer(width, [0.1, 0.9])
+        )
+        rows = value_rows(
+            SimpleNamespace(
+                solution=SimpleNamespace(best=SimpleNamespace(u=np.full(2, 0.5))),
+                names=["link.youngs_modulus", "link.damping_ratio"],
+                spec=SimpleNamespace(free=free),
+                answer=answer,
+            )
+        )
+        assert [row[-1] for row in rows] == [said] * 2
 
 
 @pytest.mark.parametrize(("size", "number"), [(1, 0), (2, 0), (2, 1)])

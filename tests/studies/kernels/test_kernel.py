@@ -526,6 +526,23 @@ def test_numbers_that_all_calls_share_are_written_once(processor):
     assert np.abs(found[0] - x).max() > 1e-3
 
 
+def test_a_record_holds_every_kind_of_number():
+    """What stays the same over a run, what is known, and what a sample brings."""
+    one = [InputLeaf((), True)]
+    loop = trace_loop(lambda c, row, x: [x[0] * c[0] + row[0]], one, one, one, np.float64)
+    constant, brought = (
+        next(x for x in loop.order if x.place == (kind, 0)) for kind in ("constant", "input")
+    )
+    loop = loop._replace(
+        leaves=loop.leaves | {"record": [InputLeaf((3,), True)]}, records=(constant, 2.0, brought)
+    )
+    rng = np.random.default_rng(0)
+    same, row, record = rng.normal(size=16), rng.normal(size=(4, 16)), np.full((4, 3, 16), np.nan)
+    cpu.build_kernel(loop).run([same, row, np.zeros(16), record], 4, 16)
+    wanted = [np.tile(same, (4, 1)), np.full((4, 16), 2.0), row]
+    np.testing.assert_array_equal(record, np.stack(wanted, axis=1))
+
+
 def test_an_upgraded_kernel_is_found_by_the_next_process(tmp_path, monkeypatch):
     """Under its name, so that it is neither traced nor run slowly again."""
     monkeypatch.setattr(compilation, "cache_folder", lambda: str(tmp_path))

@@ -29,7 +29,7 @@ from studies.laws.candidates import (
     law_candidate,
     law_candidates,
 )
-from studies.laws.findings import Combination, beyond_budget, find
+from studies.laws.findings import Combination, beyond_budget, find, verdict
 from studies.laws.judging import (
     FIGURES,
     MOVES,
@@ -349,6 +349,12 @@ def test_a_controller_that_one_machine_makes_unstable_is_out():
     findings = made_up([[1.2, 0.9, 1.5], [1.2, 1.0, np.nan]])
     assert findings.controllers[0].reason == "unstable on 1 of 3 machines"
     assert findings.competing == [1]
+
+
+def test_a_verdict_is_checked_by_every_other_figure():
+    text = " ".join(verdict(made_up([[2.0, 2.0], [3.0, 3.0]])))
+    for words in list(FIGURES.values())[1:]:
+        assert f"By {words} the verdict stands." in text
 
 
 def test_the_rms_voltage_is_that_of_each_actuator():

@@ -263,6 +263,9 @@ def test_designs_for_sensitivity():
     np.testing.assert_allclose(np.sort(step, axis=2)[..., -1], 2 / 3)
     np.testing.assert_allclose(np.sort(step, axis=2)[..., :-1], 0, atol=1e-12)
     assert np.all(np.sum(step > 0, axis=1) == 1)
+    # of three levels the middle one leads to both ends
+    rows = morris_points(40, 1, 3, 0).reshape(40, 2)
+    assert set(rows[rows[:, 0] == 0.5, 1]) == {0.0, 1.0}
 
 
 @pytest.mark.parametrize(

@@ -312,11 +312,12 @@ def test_nothing_is_proven_beyond_the_margin(design, law, loop):
         assert (len(found.undecided.low) == 0) == is_proven
 
 
-def test_a_zero_between_two_shares_ends_the_proof(design, law, loop):
+@pytest.mark.parametrize(("zero", "proven"), [(0.7, 0.6), (1.0, 0.99)])
+def test_a_zero_between_two_shares_ends_the_proof(design, law, loop, zero, proven):
     """At 0.7 of the margin, of loops that have none at 0.8: 0.6 of it is proven."""
 
     def zero_within(setup, cells, *_, **__):
-        is_there = (cells.low[:, 4] <= 2.8) & (cells.high[:, 4] >= 2.8)
+        is_there = (cells.low[:, 4] <= 4 * zero) & (cells.high[:, 4] >= 4 * zero)
         return SimpleNamespace(undecided=Cells(cells.low[is_there], cells.high[is_there]))
 
     with mock.patch.multiple(
@@ -326,7 +327,7 @@ def test_a_zero_between_two_shares_ends_the_proof(design, law, loop):
         exclude_zeros=zero_within,
     ):
         found = prove_all_modes(design, law)
-    assert found.margin == pytest.approx(0.6 * 4.0) and found.fault == ""
+    assert found.margin == pytest.approx(4 * proven) and found.fault == ""
 
 
 # --- the box --------------------------------------------------------------------------------------

@@ -36,6 +36,7 @@ from studies.spillover import run as spillover_run
 from studies.spillover.fast_move import run_fast_move
 from studies.spillover.plants import LoopBuilder, all_plants, pad_channels
 from studies.spillover.proofs import BOX, AllModes, Proofs, ProvenBox
+from studies.spillover.report import _largest
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import paper_study
 from studies.study.template import study_template
@@ -156,6 +157,15 @@ def test_leakage_of_the_papers_filter():
     np.testing.assert_allclose(other[4:7], [-1.1, 6.5, 41], rtol=0.02)
     np.testing.assert_allclose(other[[3, 7]], 0, atol=1e-9)
     np.testing.assert_allclose(found.actuation[0, 0, 0, :3], np.eye(3), atol=1e-9)
+
+
+def test_the_largest_leakage_is_named_by_its_modes_and_plant():
+    """Of plants with one number of modes."""
+    leakage = np.zeros((2, 2, 3, 2, 4))
+    leakage[1, 0, 2, 1, 3], leakage[0, 1] = -0.7, np.nan
+    plants = np.array([["a", "b"], ["c", "d"]])[..., None]
+    found = _largest(SimpleNamespace(n_controlled=2, plants=plants), leakage)
+    assert found == {"size": 0.7, "mode": 6, "controlled": 2, "plant": "c"}
 
 
 def test_plants_that_do_not_exist_are_left_out():

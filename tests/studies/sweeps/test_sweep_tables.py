@@ -616,6 +616,12 @@ def test_margins_over_decades_have_a_logarithmic_axis(margins, scale):
     assert ax.get_xscale() == scale
 
 
+def test_the_front_joins_what_has_more_margin_or_less_vibration():
+    (ax, *_) = front(usual(), "residual_rms").axes
+    assert ax.lines[0].get_xdata().tolist() == [64.0, 9.0, 8.0, 5.0, 1.5]
+    assert np.all(np.diff(ax.lines[0].get_ydata()) < 0)
+
+
 # --- the report -----------------------------------------------------------------------------------
 
 

@@ -23,7 +23,15 @@ from studies.tuning.evaluate import Evaluation
 from studies.tuning.folder import load_progress, save_progress
 from studies.tuning.linear_fidelity import BATCH, LinearFidelity
 from studies.tuning.loop_figures import machine_figures
-from studies.tuning.optimise import advance, begin, first_places, optimise, start_families
+from studies.tuning.optimise import (
+    _fresh_progress,
+    _hand_on,
+    advance,
+    begin,
+    first_places,
+    optimise,
+    start_families,
+)
 from studies.tuning.report import violated_limits
 from studies.tuning.run import make_evaluator
 from studies.tuning.scenarios import scenario_columns, tuned_machines
@@ -467,6 +475,22 @@ def test_designs_are_handed_on_along_a_front():
     best, taken = cut.winner(0), cut.winner(1)
     assert cut.best_objective[taken] <= cut.best_objective[best]
     np.testing.assert_allclose(cut.best_limits[taken, 0], cut.best_peaks[taken, 0] / 0.9 - 1)
+
+
+def test_a_design_is_handed_on_where_nothing_is_limited():
+    """To the family that moves more: its worst start goes on from there."""
+    spec = known_tuning({name: Range(0.0, 1.0, 0, False) for name in "xy"}, starts=2)
+    (both,) = spec.families
+    few = both._replace(name="few", is_free=np.array([True, False]))
+    spec = spec._replace(families=(few, both))
+    place = np.array([[0.1, 0.5], [0.2, 0.5], [0.3, 0.3], [0.4, 0.4]])
+    at = _fresh_progress(spec, place)._replace(
+        best_place=place, best_objective=np.array([1.0, 0.5, 0.8, 0.9])
+    )
+    assert at.best_limits.shape == (4, 0)
+    found = _hand_on(spec, at)
+    assert found.best_objective.tolist() == [1.0, 0.5, 0.8, 0.5]
+    np.testing.assert_array_equal(found.place, place[[0, 1, 2, 1]])
 
 
 @pytest.mark.long

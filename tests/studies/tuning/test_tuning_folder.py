@@ -29,7 +29,7 @@ from studies.tuning.folder import open_tuning
 from studies.tuning.loop_figures import DesignFigures
 from studies.tuning.objective import objective_of
 from studies.tuning.optimise import begin, is_compatible
-from studies.tuning.report import TuneFindings, best_family, n_outside, report
+from studies.tuning.report import TuneFindings, best_family, n_outside, rank_correlation, report
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import load_tuning, parse_tuning
 from tests.pages import about, parsed, text_of
@@ -282,6 +282,12 @@ def test_a_family_that_keeps_the_limits_comes_before_a_better_one():
     at = at._replace(best_limits=np.array([[0.1], [0.0]]))
     judged = [SimpleNamespace(objective=np.array([share])) for share in (0.5, 0.8)]
     assert best_family(spec, SimpleNamespace(at=at, judged=judged)) == 1
+
+
+def test_the_rank_correlation_is_spearmans():
+    a, b = np.random.default_rng(0).random((2, 20))
+    assert rank_correlation(a, b) == pytest.approx(spearmanr(a, b).statistic)
+    assert rank_correlation(a, -np.exp(a)) == pytest.approx(-1)
 
 
 @pytest.mark.long

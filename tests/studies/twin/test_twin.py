@@ -17,10 +17,11 @@ from studies.errors import StudyError
 from studies.reference.tables import frequencies
 from studies.show.document import json_text, schema
 from studies.study.spec import Study
-from studies.twin import compare, report
+from studies.twin import compare, margin, report
 from studies.twin import run as twin_run
 from studies.twin.chain import close_chain
 from studies.twin.electronics import SensorFilter
+from studies.twin.loop import _Stepper
 from studies.twin.machine import describe_machine
 from studies.twin.mesh import damping_matrix, held_modes, mesh_link
 from studies.twin.multibody import Settings, build_model
@@ -210,6 +211,7 @@ def test_without_exudyn_one_sentence_says_what_to_install(capsys, monkeypatch, t
         ({"link__basis": "pinned_free", "link__shortening": False}, "link.basis"),
         ({"initial__modal": ((1e-6,), (), ())}, "initial.modal"),
         ({"initial__load_deflection": (1e-6, 0.0, 0.0)}, "initial.load_deflection"),
+        ({"patches__hysteresis": 0.1}, "patches.hysteresis"),
     ],
 )
 def test_what_the_twin_cannot_repeat_is_refused(fields, named):
@@ -230,6 +232,79 @@ def test_runs_are_compared_after_the_reference_trajectory():
         command_end=0.06, n_samples=1000, electronics=SimpleNamespace(period=1e-4)
     )
     assert compare.in_window(plan) == slice(600, 1000)
+
+
+def signals(deflection, volts):
+    """Four samples in which each link has its own number."""
+    rows = [np.tile(x, (4, 1)) for x in (deflection, np.zeros(3))]
+    return SimpleNamespace(
+        deflection=rows[0], pose_error=rows[1], voltage=np.full((4, 3, 2), volts)
+    )
+
+
+def test_each_quantity_has_a_row_for_each_link_and_one_for_all():
+    runs = compare.BothRuns(
+        *(
+            compare.BothModels(
+                signals(size * np.array([3e-6, 4e-6, 0.0]), 5.0 * size),
+                signals(size * np.array([6e-6, 8e-6, 0.0]), 4.0 * size),
+            )
+            for size in (1.0, 10.0)
+        )
+    )
+    plan = SimpleNamespace(rho=np.zeros((4, 3)), pose=np.zeros(3))
+    result = SimpleNamespace(plan=plan, runs=runs, window=slice(1, 4))
+    rows = {name: cells for name, *cells in report.gap_rows(result)}
+    bent = "mid-span deflection, "
+    assert rows[f"{bent}link 2, without control"] == ["4 µm", "8 µm", "4 µm", "50 %"]
+    assert rows[f"{bent}link 2, with control"] == ["40 µm", "80 µm", "40 µm", "50 %"]
+    together = [f"{x / 3**0.5:.4g} µm" for x in (5.0, 10.0, 5.0)]
+    assert rows[f"{bent}all together, without control"] == [*together, "50 %"]
+    assert rows["voltage, link 1, with control"] == ["50 V", "40 V", "10 V", "25 %"]
+    assert "voltage, link 1, without control" not in rows
+
+
+@pytest.mark.parametrize(
+    ("grows", "is_confirmed"),
+    [
+        (lambda factor: factor > 2, True),
+        (lambda factor: True, False),
+        (lambda factor: False, False),
+    ],
+)
+def test_a_margin_by_growth_is_confirmed_on_both_sides(monkeypatch, grows, is_confirmed):
+    """Of a made-up loop whose pole crosses at twice the gains."""
+
+    class Search:
+        runs = 2
+
+        def __init__(self, *arguments):
+            pass
+
+        def pole(self, factor, near):
+            return complex(10 * (factor - 2), 2000 * np.pi)
+
+        def is_growing(self, factor):
+            return grows(factor)
+
+    monkeypatch.setattr(margin, "_Search", Search)
+    found = margin.margin_by_growth(None, None, None, 1.9)
+    assert found.is_confirmed is is_confirmed
+    np.testing.assert_allclose([found.margin, found.frequency], [2.0, 1000.0], rtol=1e-12)
+
+
+def test_voltages_change_in_the_middle_of_the_step_at_the_sample():
+    """A step ends at a sample with the mean of the commands before and after it."""
+    put = []
+    stepper = SimpleNamespace(
+        plan=SimpleNamespace(electronics=SimpleNamespace(lag=0.0), wrench=np.zeros(3)),
+        reader=SimpleNamespace(put_voltages=put.append),
+        now=1.0,
+        next=3.0,
+    )
+    for part in range(4):
+        _Stepper._put_loads(stepper, 5, part)
+    assert put == [2.0, 1.0]
 
 
 def test_each_change_has_the_differences_without_and_with_control(monkeypatch):
