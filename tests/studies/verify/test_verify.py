@@ -20,7 +20,7 @@ from studies import passport
 from studies.show.document import schema
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import load_study, paper_study, parse_study
-from studies.verify import commands, links, loops, run, stepping, trajectories
+from studies.verify import commands, links, loops, machine, run, stepping, trajectories
 from studies.verify.prepared import prepared
 from studies.verify.rows import Assumption, largest, worst, worst_relative
 from tests import TOP
@@ -366,6 +366,56 @@ def test_what_passes():
     # the built-in max passes over a NaN that is not first
     assert worst(0.0, np.nan) == worst(np.nan, 0.0) == worst([0.0, np.nan]) == np.inf
     assert worst(0.5, [0.1, 2.0]) == 2.0
+
+
+def test_what_is_left_out_is_no_part_of_the_outcome():
+    rows = row(1e-4), row(2e-3), row(0.0, left_out="nothing there")
+    summary = run.ModelVerification(paper_study(), rows).summary
+    assert (summary.rows, summary.passed, summary.failed) == (2, 1, ("x",))
+
+
+def test_patches_that_see_or_do_too_much_are_noticed():
+    """A link's sensors 1 % above, or actuators 2 % above, constants times slopes."""
+    bends = np.array([[0.5, 2.0], [1.0, -3.0]]), np.array([[1.0, 0.5], [2.0, 4.0]])  # (K, R)
+    basis = SimpleNamespace(mass=np.array([[0.5, 0.25]]))
+    sees, does = 3.0 * bends[0], 2.0 * bends[1].T / basis.mass.T
+    for more, wanted in (((1.0, 1.0), 0.0), ((1.01, 1.0), 0.01 / 1.0), ((1.0, 1.02), 0.02)):
+        loop = SimpleNamespace(sensor=[more[0] * sees], actuator=[more[1] * does])
+        found = links._signals(loop, 0, (2.0, 3.0), bends, basis)
+        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-15)
+
+
+def test_exported_code_that_differs_fails():
+    checks = [SimpleNamespace(is_met=x, what=f"run {x}", found="1e-3") for x in (True, False)]
+    with (
+        mock.patch.object(loops, "find_compiler", lambda: "cc"),
+        mock.patch.object(loops, "reference_run", lambda _: None),
+        mock.patch.object(loops, "verify_floating", lambda *_: SimpleNamespace(checks=checks)),
+    ):
+        failed = loops._exported(study_of(TINY))
+        checks.pop()
+        passed = loops._exported(study_of(TINY))
+    assert (failed.outcome, failed.note) == ("FAILED", "run False: 1e-3")
+    assert (passed.outcome, passed.note) == ("passed", "")
+
+
+def test_accelerations_of_the_modes_are_compared_like_those_of_the_pose(monkeypatch):
+    """Of made-up accelerations of a pose of three and two modes: those of the modes are wrong."""
+    found, wanted = np.ones((4, 5)), np.ones((4, 5))
+    wanted[2, 4] = 1.25
+    for name, result in (
+        ("_plant", {}),
+        ("_random_states", None),
+        ("_both", (found, wanted, np.zeros(4))),
+    ):
+        monkeypatch.setattr(machine, name, lambda *_, result=result: result)
+    structure = SimpleNamespace(
+        has_shortening=True, basis="pinned_free", n_pose=3, n_modes=2, is_coupled=True
+    )
+    case = SimpleNamespace(machine=SimpleNamespace(beam=SimpleNamespace(length=0.2)))
+    whole = SimpleNamespace(_replace=lambda **_: None)
+    accelerations, closure = machine._accelerations(paper_study(), structure, case, whole)
+    assert accelerations.difference == pytest.approx(0.2) and closure.is_passed
 
 
 @pytest.fixture
