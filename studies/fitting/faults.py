@@ -23,7 +23,8 @@ DELAYS = np.concatenate([-np.geomspace(1e-2, 2e-5, 60), np.geomspace(2e-5, 1e-2,
 GAINS = {
     2 * np.pi: "2 pi",
     1 / (2 * np.pi): "1/(2 pi)",
-    9.80665: "9.81, as of accelerations in g",
+    1 / 9.80665: "1/9.81, as of accelerations in g",
+    9.80665: "9.81, as of accelerations in m/s2 with the sensitivity for g",
     1e3: "1000",
     1e-3: "1/1000",
     2.0: "2",
@@ -34,6 +35,7 @@ TWO_PI = 2 * np.pi
 IN_RADIANS = "its frequencies are in rad/s"
 T = TypeVar("T", bound=Measurement)
 F = TypeVar("F", ComplexResponse, Magnitude, Spectrum)
+G = TypeVar("G", ComplexResponse, Magnitude, Trace)
 
 
 class Fault(NamedTuple):
@@ -59,10 +61,8 @@ def fault_of(one: Measurement, values: np.ndarray, better: float) -> Fault | Non
         except (StudyError, np.linalg.LinAlgError):
             continue
         rated.append((square, fault))
-    if not rated:
-        return None
     own = float(np.sum(one.residual(values, False).value ** 2))
-    least = min(square for square, _ in rated)
+    least = min((square for square, _ in rated), default=np.inf)
     if least * better > own:
         return None
     return next(fault for square, fault in rated if square <= AS_GOOD * least)
@@ -84,20 +84,20 @@ def _faults(one: Measurement, values: np.ndarray) -> Iterator[Fault]:
         yield from _of_response(one, values)
     if isinstance(one, Magnitude):
         yield Fault(IN_RADIANS, _stretched(one, values))
-        yield from _named_gains(one)
+        yield from _named_gains(one, values)
         yield from _other_channels(one, values)
-        yield from _gain(one, np.abs(one.predict(values, False)[0]))
+        yield from _gain(one, values, np.abs(one.predict(values, False)[0]))
     if isinstance(one, Trace):
         yield from _of_trace(one, values)
 
 
 def _of_response(one: ComplexResponse, values: np.ndarray) -> Iterator[Fault]:
-    yield Fault("its polarity is reversed", _times(one, -1.0))
+    yield Fault("its polarity is reversed", _times(one, values, -1.0))
     yield Fault(
         "it is conjugated, as with exp(-j omega t)", _with(one, measured=one.measured.conj())
     )
     yield Fault(IN_RADIANS, _stretched(one, values))
-    yield from _named_gains(one)
+    yield from _named_gains(one, values)
     yield from _other_channels(one, values)
     model, _ = one.predict(values, False)
     weight = 1 / one.sigma**2
@@ -107,17 +107,16 @@ def _of_response(one: ComplexResponse, values: np.ndarray) -> Iterator[Fault]:
 
     delay = _least(lambda x: float(np.sum(weight * np.abs(turned(x) - model) ** 2)))
     yield _late(delay, _with(one, measured=turned(delay)))
-    yield from _gain(one, model)
-    gain = _best_gain(one, model)
-    if gain:
+    yield from _gain(one, values, model)
+    if gain := _best_gain(one, model):
         angle = -np.degrees(np.angle(gain))
         text = f"its gain is wrong by a factor of {1 / abs(gain):.4g} and {angle:.3g} deg"
-        yield Fault(text, _times(one, gain))
+        yield Fault(text, _times(one, values, gain))
 
 
 def _of_trace(one: Trace, values: np.ndarray) -> Iterator[Fault]:
-    yield Fault("its polarity is reversed", _times(one, -1.0))
-    yield from _named_gains(one)
+    yield Fault("its polarity is reversed", _times(one, values, -1.0))
+    yield from _named_gains(one, values)
     for text, signal in _others(one.signal, "sensor", one.patches):
         yield Fault(text, _weighed(one, values, signal=signal))
 
@@ -126,7 +125,7 @@ def _of_trace(one: Trace, values: np.ndarray) -> Iterator[Fault]:
 
     delay = _least(lambda x: float(np.sum(shifted(x).residual(values, False).value ** 2)))
     yield _late(delay, shifted(delay))
-    yield from _gain(one, one.predict(values, False)[0])
+    yield from _gain(one, values, one.predict(values, False)[0])
 
 
 def _late(delay: float, mended: Measurement) -> Fault:
@@ -141,18 +140,18 @@ def _least(square: Callable[[float], float]) -> float:
     return float(near[int(np.argmin([square(x) for x in near]))])
 
 
-def _named_gains(one: Measurement) -> Iterator[Fault]:
+def _named_gains(one: G, values: np.ndarray) -> Iterator[Fault]:
     for gain, name in GAINS.items():
-        yield Fault(f"it is too large by a factor of {name}", _times(one, 1 / gain))
+        yield Fault(f"it is too large by a factor of {name}", _times(one, values, 1 / gain))
 
 
-def _gain(one: Measurement, model: np.ndarray) -> Iterator[Fault]:
+def _gain(one: G, values: np.ndarray, model: np.ndarray) -> Iterator[Fault]:
     size = abs(_best_gain(one, model))
     if size > 0:
-        yield Fault("its gain is wrong by a factor of {:.4g}", _times(one, size), 1 / size)
+        yield Fault("its gain is wrong by a factor of {:.4g}", _times(one, values, size), 1 / size)
 
 
-def _best_gain(one: Measurement, model: np.ndarray) -> complex:
+def _best_gain(one: G, model: np.ndarray) -> complex:
     """Of least squares, from measured values to the model's."""
     weight = 1 / one.sigma**2
     power = np.sum(weight * np.abs(one.measured) ** 2)
@@ -174,9 +173,10 @@ def _with(one: T, **changes: object) -> T:
     return other
 
 
-def _times(one: T, gain: complex) -> T:
+def _times(one: G, values: np.ndarray, gain: complex) -> G:
     factor = gain if np.iscomplexobj(one.measured) else gain.real
-    return _with(one, measured=factor * one.measured, sigma=abs(factor) * one.sigma)
+    noise = one._noise._replace(fixed=abs(factor) * one._noise.fixed)  # a share of the model stays
+    return _weighed(one, values, measured=factor * one.measured, _noise=noise)
 
 
 def _stretched(one: F, values: np.ndarray) -> F:

@@ -102,7 +102,9 @@ few_programs = partial(
 
 
 def scaled(one, factor):
+    """With another gain, and its noise as it is then seen."""
     one.measured, one.sigma = factor * one.measured, abs(factor) * one.sigma
+    one._noise = one._noise._replace(fixed=abs(factor) * one._noise.fixed)
     return one
 
 
@@ -150,6 +152,21 @@ def test_the_fault_of_the_data_is_named(measured, name):
     assert size is None or float(found[1]) == pytest.approx(size, rel=0.02)
     count = 2 * len(LINES) * len(SIGNALS)
     assert best.after < 1.3 * count and best.before > 3 * best.after
+
+
+@pytest.mark.parametrize("entry", [RESPONSE, MAGNITUDE])
+@pytest.mark.parametrize("gain", [2.0, 0.5, 3.3])
+def test_a_mended_gain_leaves_the_chi_square_of_sound_data(folder, bench, entry, gain):
+    """Noise that is a share of the model does not grow with a gain of the data."""
+    (one,) = posed(asked(folder, entry | {"sigma_percent": 1.0}), bench).measurements
+    give_data(bench, one, TRUE, np.random.default_rng(0))
+    one.reweigh(TRUE)
+    wanted = np.sum(one.residual(TRUE, False).value ** 2)
+    sigma = one.sigma
+    one = scaled(one, gain)
+    one.sigma = sigma  # from the model
+    mended = fault_of(one, TRUE, BETTER).mended
+    np.testing.assert_allclose(np.sum(mended.residual(TRUE, False).value ** 2), wanted, rtol=0.01)
 
 
 def test_exchanged_channels_are_named(measured):
@@ -210,6 +227,7 @@ def test_faults_of_other_kinds_are_named(folder, bench, entry, spoil, said):
     [
         (lambda x: scaled(x, -1.0), "its polarity is reversed"),
         (lambda x: scaled(x, 9.80665), "it is too large by a factor of 9.81"),
+        (lambda x: scaled(x, 1 / 9.80665), "it is too large by a factor of 1/9.81, as of acc"),
         (lambda x: moved(x, 3e-4), r"it is late by 0\.(29|30|31)\d* ms"),
         (of_another_sensor, r"its sensor is 3\.2"),
     ],
