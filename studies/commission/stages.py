@@ -38,9 +38,9 @@ class Stage(NamedTuple):
 
     name: str  # of its folder
     text: str
-    page: str  # its report
     last: tuple[str, ...]  # files of the folder of all stages, of which one is written at its end
     make: Callable[[MeasuredSpec, Path, Console], None]  # in the folder of all stages
+    page: str = REPORT
 
     def is_done(self, out: Path) -> bool:
         """Whether the folder holds its answer."""
@@ -88,19 +88,18 @@ def _export(measured: MeasuredSpec, out: Path, console: Console) -> None:
     )
 
 
+CERTIFIED = f"certificate/{CERTIFICATE}"
 #: In their order.
 STAGES = (
-    Stage("fit", "fit the model to the measurements", REPORT, (f"fit/{DOCUMENT}",), _fit),
-    Stage("tune", "tune on machines that the data leave possible", REPORT, (DESIGN,), _tune),
+    Stage("fit", "fit the model to the measurements", (f"fit/{DOCUMENT}",), _fit),
+    Stage("tune", "tune on machines that the data leave possible", (DESIGN,), _tune),
+    Stage("certificate", "certify on plants that differ from the model", (CERTIFIED,), _certify),
     Stage(
-        *("certificate", "certify on plants that differ from the model", REPORT),
-        (f"certificate/{CERTIFICATE}",),
-        _certify,
-    ),
-    Stage(
-        *("firmware", "export, compare, emulate", VERIFICATION),
+        "firmware",
+        "export, compare, emulate",
         (f"firmware/{VERIFICATION}", f"firmware/{FAILED}"),
         _export,
+        page=VERIFICATION,
     ),
 )
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 
 from jaxmodel import dynamics, kinematics, status
 from jaxmodel.beam import build_basis
@@ -23,7 +24,7 @@ from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.reference import lagrangian as reference
 from studies.show.figures import styled
-from studies.show.sketch import sketch, standing
+from studies.show.sketch import link_parts, sketch, standing
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table
 from studies.store import Variable
@@ -393,6 +394,13 @@ def test_a_sketch_draws_each_link_and_patch_to_scale():
         for height in (width, 5 * thickness)
     ]
     np.testing.assert_allclose(sorted(drawn), sorted(pairs), rtol=1e-9, atol=1e-9)
+
+
+def test_parts_of_a_sketch_have_the_colours_of_its_caption():
+    study = parse_study({"patches": {"actuator_length": 0.04, "sensor_length": 0.02}})
+    channels = {part.length: "rgb"[np.argmax(to_rgb(part.color))] for part in link_parts(study, 0)}
+    # blue: a link under control, orange: actuators, green: sensors
+    assert channels == {study.link.length: "b", 0.04: "r", 0.02: "g"}
 
 
 def test_links_across_their_guides_are_misplaced():

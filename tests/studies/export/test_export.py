@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 from unittest import mock
 
 import jsonschema
@@ -17,7 +18,7 @@ from studies.export import sequences, targets
 from studies.export.compiler import STRICT
 from studies.export.document import document, import_study, study_hash
 from studies.export.verify import AIM
-from studies.study.spec import load_study
+from studies.study.spec import load_study, paper_study
 from tests import TOP
 from tests.exports import (
     DESIGNS,
@@ -416,6 +417,12 @@ def test_designs_of_a_tuning(capsys, designs, tmp_path):
 def test_document_names_the_case_of_a_sweep(designs):
     found = fixed_controller(load_study(designs["paper"]))
     assert document(found, "0123456789abcdef").case_id == "0123456789abcdef"
+
+
+def test_headers_count_links_from_1():
+    study = paper_study().change(control__links=(True, False, True))
+    header = " ".join(export_run._origin(SimpleNamespace(study=study), ""))
+    assert "controlled links 1+3," in header
 
 
 def test_a_motion_at_the_end_of_the_adc_is_refused(capsys, tmp_path):

@@ -4,6 +4,7 @@ import io
 import json
 import re
 import time
+from types import SimpleNamespace
 from unittest import mock
 
 import h5py
@@ -643,6 +644,17 @@ def test_samples_are_drawn_in_pairs():
     shown = samples(np.random.default_rng(0).normal(size=(50, 3)), ("a", "b", "c")).axes
     assert [ax.get_visible() for ax in shown] == [k // 3 >= k % 3 for k in range(9)]
     assert shown[6].get_xlabel() == "a" and shown[6].get_ylabel() == "c"
+
+
+def test_samples_of_two_numbers_are_drawn():
+    fitted = SimpleNamespace(
+        names=("control.gain_factor", "drive.kp"),
+        comparisons=[],
+        answer=SimpleNamespace(correlation=np.eye(2)),
+        profiles=[],
+        posterior=SimpleNamespace(values=np.random.default_rng(0).normal(size=(50, 2))),
+    )
+    assert list(dict(all_figures(fitted))) == ["correlations", "samples"]
 
 
 def test_folders_that_cannot_be_are_refused_before_the_work(tmp_path):

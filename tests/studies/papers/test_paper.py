@@ -304,6 +304,17 @@ def test_report_holds_the_papers_numbers_and_those_of_the_run(short):
         assert f"![{name}]" in text
     rows = [line for line in text.splitlines() if line.startswith("|")]
     assert len(rows) > 51
+    assert any(row.startswith("| first two: x, y, φ | by more than -50 % |") for row in rows)
+
+
+def test_settling_times_of_the_result_are_those_of_its_table(short):
+    fitted = short.machines.fitted
+    settling = 1e-3 * np.arange(fitted.measures.settling.size).reshape(-1, 3)
+    made_up = fitted._replace(measures=fitted.measures._replace(settling=settling))
+    off, on = tables.settling_rows(Machines(made_up, made_up))[:2]
+    result = report._agreement(made_up)
+    for row, times in ((off, result["free"]), (on, result["held"])):
+        assert row[2] == ", ".join(f"{time:.0f}" for time in times)
 
 
 def test_every_figure_stands_beside_its_table():
@@ -327,6 +338,7 @@ def test_formatting():
 def test_every_figure_has_units_on_its_axes(short):
     for draw in paper_figures.PAPER_FIGURES.values():
         drawn = draw(short.machines)
+        assert all(ax.has_data() for ax in drawn.axes)
         labels = [ax.get_xlabel() for ax in drawn.axes if ax.get_xlabel()]
         labels += [ax.get_ylabel() for ax in drawn.axes if ax.get_ylabel()]
         # three rows over two columns: three ordinates, two abscissas

@@ -3,6 +3,7 @@
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -22,6 +23,8 @@ from studies.study.files import read_toml
 from studies.study.spec import load_study, paper_study
 from studies.sweeps.show import ranked_cases
 from studies.tuning import audit as audit_module
+from studies.tuning import results
+from studies.tuning import run as tuning_run
 from studies.tuning.audit import Disagreement
 from studies.tuning.check import JudgedDesign, OwnRun
 from studies.tuning.evaluate import Evaluation, Evaluator
@@ -276,12 +279,47 @@ def test_a_report_says_what_its_numbers_are():
     assert "Of links 1 and 3, the controlled ones, the largest value counts" in text
 
 
-def test_a_family_that_keeps_the_limits_comes_before_a_better_one():
+def loud_and_calm():
+    """A tuning whose better family exceeds its limit; results of it that no run has given."""
     spec = tuning(GAIN, starts=1, limits={"peak_voltage": 30.0}, families={"loud": {}, "calm": {}})
     at = begin(spec, SimpleNamespace(linear=None))
-    at = at._replace(best_limits=np.array([[0.1], [0.0]]))
+    at = at._replace(best_limits=np.array([[0.1], [0.0]]), best_place=np.array([[0.9], [0.2]]))
     judged = [SimpleNamespace(objective=np.array([share])) for share in (0.5, 0.8)]
-    assert best_family(spec, SimpleNamespace(at=at, judged=judged)) == 1
+    return spec, SimpleNamespace(at=at, judged=judged)
+
+
+def test_a_family_that_keeps_the_limits_comes_before_a_better_one():
+    assert best_family(*loud_and_calm()) == 1
+
+
+def test_the_machine_shown_is_the_recommended_one(tmp_path):
+    spec, found = loud_and_calm()
+    shown = mock.Mock()
+    made_up = {
+        "tuned_study": lambda *x: spec.study.change(control__gain_factor=x[2][0]),
+        "variables": lambda *_: {},
+        "report": lambda *_: "",
+    }
+    drawn = dict.fromkeys(("plots", "save", "write_figure"), mock.Mock())
+    with mock.patch.multiple(tuning_run, sketch=shown, **made_up, **drawn):
+        tuning_run._write(spec, found, tmp_path / "out")
+    (study,), _ = shown.call_args
+    loud, calm = spec.free.values(found.at.best_place)[:, 0]
+    assert study.control.gain_factor == calm != loud
+    assert load_study(tmp_path / "out" / "tuned_calm.toml") == study
+
+
+def test_each_family_has_one_best_start():
+    spec, found = loud_and_calm()
+    at = found.at._replace(
+        family=np.array([0, 0, 1, 1]),
+        best_place=np.full((4, 1), 0.5),
+        best_objective=np.array([0.9, 0.5, 0.8, 0.7]),
+        best_limits=np.zeros((4, 1)),
+    )
+    with mock.patch.object(results, "patch_centers", lambda *_: 0.0):  # compiles
+        starts = results._starts(spec, SimpleNamespace(at=at, linear=np.full(4, np.nan)))
+    assert starts["is_best"].data.tolist() == [False, True, False, True]
 
 
 def test_the_rank_correlation_is_spearmans():
