@@ -13,7 +13,17 @@ from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
 
-from studies.atlas import attribution, claims, figures, findings, platform, run, subsets, workspace
+from studies.atlas import (
+    attribution,
+    claims,
+    figures,
+    findings,
+    platform,
+    plots,
+    run,
+    subsets,
+    workspace,
+)
 from studies.atlas.platform import LINK_SETS, platform_error, responses
 from studies.atlas.report import _runs
 from studies.engine.modes import machine_modes
@@ -241,6 +251,20 @@ def test_map_at_home_is_that_of_the_machine(atlas):
 def test_a_pose_out_of_reach_is_refused():
     with pytest.raises(StudyError, match="pose = .*gamma is inside"):
         workspace.natural_modes_at(small_study(), [(0.2, 0.0, 0.5)])
+
+
+def test_the_squared_margin_falls_below_zero_out_of_reach():
+    empty = workspace.Map(*[np.zeros(0)] * len(workspace.Map._fields))
+    lift = np.sin([[0.2, 0.7, 0.7], [1.4, 0.7, 0.7], [-0.2, 0.7, 0.7], [0.7, 0.7, 0.7]])
+    lift[3, 1] = 1.5
+    wanted = [0.2**2, (np.pi / 2 - 1.4) ** 2, -(0.2**2), -1.0]
+    np.testing.assert_allclose(empty._replace(lift=lift).squared_margin, wanted, rtol=1e-9)
+
+
+def test_the_map_of_interactions_is_in_per_cent():
+    image = plots.interaction_map(np.array([[0.0, -0.05], [-0.05, 0.0]]), ["a", "b"], 0.2)
+    np.testing.assert_allclose(image.get_array(), [[0.0, -5.0], [-5.0, 0.0]])
+    assert image.get_clim() == (-20.0, 20.0)
 
 
 def made_up(link, platform):

@@ -1,7 +1,9 @@
 """Exported controllers on emulated processors, and the project that builds them."""
 
+import os
 import re
 import shutil
+import struct
 import subprocess
 from types import SimpleNamespace
 from unittest import mock
@@ -22,7 +24,7 @@ from studies.export.firmware.build import (
     check_tools,
     stack_bound,
 )
-from studies.export.firmware.emulator import emulated
+from studies.export.firmware.emulator import EmulatedCode, emulated
 from studies.export.firmware.project import project_files, write_files
 from studies.export.verify import Exchange
 from tests.exports import DESIGNS, needs_compiler, needs_cpp, write_study
@@ -163,6 +165,20 @@ def test_fixed_point_is_the_same_on_all_processors(compared, board, monkeypatch)
     found = on_target.verify_on_target(compared._replace(board=BOARDS[board]))
     assert failed(found) == {}
     assert len(found.instructions["random input with faults and resets"]) == 210_000
+
+
+def test_instructions_of_a_sample_are_counted_from_ticks():
+    """Of a program that answers one sample: 400 ticks, and a depth of 96 bytes."""
+    answers = struct.pack("<6I 3f iII", 1, 4, 4, 8, 8, 1024, 1.0, 2.0, 3.0, 0, 400, 96)
+    (there, to), (back, answer) = os.pipe(), os.pipe()
+    os.write(answer, answers)
+    code = EmulatedCode(SimpleNamespace(poll=lambda: 0), (to, back))
+    values, fault = code.step(np.zeros((3, 1)))
+    for pipe in (there, to, back, answer):
+        os.close(pipe)
+    assert (values.tolist(), fault, code.depth) == ([1.0, 2.0, 3.0], 0, 96)
+    each = 2**7 * 1e-9 * 25e6  # ticks of 25 MHz in an instruction of 128 ns
+    assert [x.tolist() for x in code.instructions] == [[1 + 400 / each]]
 
 
 @pytest.fixture(scope="module")

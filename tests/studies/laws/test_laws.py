@@ -1,6 +1,8 @@
 """`studies laws`: candidates, what they are judged on, and whether an order is certain."""
 
 import json
+from threading import Event
+from time import sleep
 from types import SimpleNamespace
 from unittest import mock
 
@@ -226,6 +228,34 @@ def test_a_damaged_tuning_is_not_a_law_that_fails(own_law, tmp_path):
     file.write_bytes(b"no archive")
     with pytest.raises(StudyError, match="damaged"):
         tune_candidate(STUDY, own_law, Budget(50.0, 0.4), file, print)
+
+
+def test_a_tuning_that_fails_ends_those_beside_it(tmp_path):
+    begun, ended = Event(), Event()
+
+    def tune(study, candidate, budget, file, say):
+        if candidate.name == "bad":
+            assert begun.wait(10)
+            raise StudyError("bad")
+        begun.set()
+        try:
+            for _ in range(100):
+                say("an iteration")
+                sleep(0.02)
+        except KeyboardInterrupt:
+            ended.set()
+            raise
+
+    pair = [Contender(name, {}, {}, {}) for name in ("bad", "good")]
+    told = SimpleNamespace(begin=lambda *_: None, advance=lambda *_: None)
+    with (
+        mock.patch.multiple(
+            laws, law_candidates=lambda _: pair, drive_candidates=lambda _: [], tune_candidate=tune
+        ),
+        pytest.raises(StudyError, match="bad"),
+    ):
+        laws._tune(STUDY, tmp_path, Budget(50.0, 0.4), told)
+    assert ended.wait(5)
 
 
 def test_what_says_how_far_a_tuning_has_come(own_law):

@@ -5,6 +5,7 @@ import io
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 from unittest import mock
 
@@ -24,9 +25,9 @@ from studies.errors import StudyError
 from studies.papers import run as papers
 from studies.papers.zhang_2016 import card as paper
 from studies.papers.zhang_2016 import cases as paper_cases
+from studies.papers.zhang_2016 import claims, report, tables
 from studies.papers.zhang_2016 import context as report_context
 from studies.papers.zhang_2016 import figures as paper_figures
-from studies.papers.zhang_2016 import report, tables
 from studies.papers.zhang_2016.cases import ALL, MOVES, OFF, ONE, SHAPERS, TWO, run_cases
 from studies.papers.zhang_2016.claims import CLAIMS, LEFT_OPEN
 from studies.papers.zhang_2016.context import Context, Machines
@@ -204,6 +205,13 @@ def test_fitted_machine_has_the_measured_frequencies():
     hz = paper_cases.link_hz(*check_run(paper_cases.fitted_study()))[:, :2]
     apart = np.sort(np.abs(hz - np.array(tables.FREQUENCIES)), axis=0)
     assert apart[0].max() < 0.2 and apart[1].max() < 0.7
+
+
+def test_both_frequencies_of_the_paper_are_those_of_one_link():
+    near, far = np.array([92.5, 241.3]), np.array([95.0, 250.0])
+    for hz, is_met in (([near, far], True), ([(near[0], far[1]), (far[0], near[1])], False)):
+        runs = SimpleNamespace(link_hz=np.array(hz))
+        assert claims._frequencies(SimpleNamespace(runs=runs))[0] is is_met
 
 
 @pytest.mark.long  # in short: its frequencies, and Table 1 of another machine in the report

@@ -32,7 +32,7 @@ from studies.papers.gupta_2010.criteria import (
     modal_force,
     observability,
 )
-from studies.papers.gupta_2010.findings import PlaceGrid, rank
+from studies.papers.gupta_2010.findings import PlaceGrid, PlacementFindings, rank
 from studies.papers.rrr_2016 import card as rrr_card
 from studies.papers.rrr_2016 import confirmation, energies, findings, thresholds
 from studies.papers.rrr_2016.claims import judge
@@ -436,6 +436,10 @@ def test_loss_and_rank_of_a_criterion():
     other = rank(np.array([2.0, 1.0, 3.0]), loops)
     assert other.loss == pytest.approx(0.7 / 0.5 - 1)
     assert other.correlation == pytest.approx(-1.0)
+    figure = gupta_card.draw(PlacementFindings(paper_study(), loops, {"same": same}))
+    (removed,) = figure.axes[0].lines  # [%], over the places [mm]
+    np.testing.assert_allclose(removed.get_xdata(), [100.0, 200.0, 300.0])
+    np.testing.assert_allclose(removed.get_ydata(), [40.0, 50.0, 30.0])
 
 
 def test_placement_card_writes_a_whole_folder(tmp_path):

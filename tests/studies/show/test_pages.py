@@ -8,13 +8,14 @@ import re
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from jinja2 import ChoiceLoader, DictLoader
 from matplotlib.figure import Figure
 
 import studies
 from studies.show import pages
-from studies.show.figures import SMALL, WIDTH, new_figure, styled
+from studies.show.figures import SMALL, WIDTH, is_wide, new_figure, styled
 from studies.show.pages import page
 from studies.study import spec as spec_module
 from studies.study.template import toml_text
@@ -125,6 +126,11 @@ def test_small_text_in_a_figure_is_found():
         axes[0, 0].set_title("large", fontsize=SMALL)
         assert smallest_text(figure)[0] == pytest.approx(40 * 16 / WIDTH * SMALL / 72)
     assert 40 * 16 / WIDTH * 6 / 72 < READABLE < 40 * 16 / WIDTH * SMALL / 72
+
+
+def test_numbers_need_a_logarithmic_scale_if_all_are_positive_and_far_apart():
+    assert is_wide(np.array([1.0, np.nan, 31.0])) and not is_wide(np.array([1.0, 29.0]))
+    assert not is_wide(np.array([-1.0, 1.0, 100.0])) and not is_wide(np.array([np.nan]))
 
 
 def test_a_figure_without_its_image_is_a_fault_of_the_program(fill_report):

@@ -24,7 +24,7 @@ from studies.sweeps.dry_run import axis_rows
 from studies.sweeps.explore import _figure
 from studies.sweeps.plots import front
 from studies.sweeps.report import report
-from studies.sweeps.screening import check_screen
+from studies.sweeps.screening import check_screen, draw_screen
 from studies.sweeps.sensitivity import analyse, failure_causes
 from studies.sweeps.show import (
     best_cases,
@@ -687,8 +687,13 @@ def test_the_error_of_a_screen_is_a_share_of_the_full_model_s_value():
     screen = {"by": "residual_rms", "keep": 1.0}
     axes = {"axes": {"gain": GAINS}, "metrics": ["residual_rms"], "screen": screen}
     half = {"screen_status": np.zeros(8, int), "screen_value": 0.5 * RMS}
-    checked = check_screen(made_up(axes, residual_rms=of_stations(RMS), **half))
-    assert "On 8 random cases the linear model is off by 50 % in the median" in checked.text
+    data = made_up(axes, residual_rms=of_stations(RMS), **half)
+    text = check_screen(data).text
+    assert "On 8 random cases the linear model is off by 50 % in the median" in text
+    (axes,) = draw_screen(data).axes
+    for cases in axes.lines[:2]:  # random ones, and those that passed; in um
+        np.testing.assert_allclose(np.sort(cases.get_xdata()), np.sort(0.5e6 * RMS))
+        np.testing.assert_allclose(cases.get_ydata(), 2 * cases.get_xdata())
 
 
 def test_ties_keep_the_order_of_the_cases():

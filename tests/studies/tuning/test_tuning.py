@@ -17,7 +17,7 @@ from studies.errors import StudyError
 from studies.space.axes import Range
 from studies.space.free import Free, FreeNumbers
 from studies.study.spec import paper_study
-from studies.tuning import linear_fidelity, loop_figures
+from studies.tuning import linear_fidelity, loop_figures, loop_programs
 from studies.tuning.check import tuned_study
 from studies.tuning.evaluate import Evaluation
 from studies.tuning.folder import load_progress, save_progress
@@ -147,6 +147,21 @@ def test_figures_can_be_recomputed_from_runs(evaluated):
     assert len(set(objective)) == 4
     np.testing.assert_allclose(found.objective[0], np.mean(objective), rtol=1e-7)
     np.testing.assert_allclose(found.limits[0, 0], np.max(excess), rtol=1e-6)
+
+
+def test_the_loop_of_figures_is_that_of_the_first_pose():
+    case = SimpleNamespace(path=SimpleNamespace(waypoints=np.array(((1.0, 2.0), (3.0, 4.0)))))
+    with mock.patch.object(loop_figures, "closed_loop", lambda *given: given[-1]):
+        pose = loop_figures._closed_loop.__wrapped__(None, case)
+    assert pose.tolist() == [1.0, 2.0]
+
+
+def test_a_path_nearer_to_singularities_than_its_limit_violates_it():
+    loop = loop_programs._Loop(None, None, None, {}, 1.0)
+    for distance, x in ((0.05, 0.5), (0.1, 0.0), (0.2, -1.0)):
+        with mock.patch.object(loop_programs, "distance_of_path", lambda *_, at=distance: at):
+            found = loop_programs._excess(loop, ("singularity_distance",), np.array([0.1]))
+        np.testing.assert_allclose(found, [x / (1 + abs(x))])
 
 
 def test_limits_of_the_loop_are_those_of_the_worst_machine(evaluated):

@@ -17,10 +17,11 @@ from rich.console import Console
 
 from jaxmodel.shaper import SHAPERS, Impulses
 from studies import passport
+from studies.reference import tables
 from studies.show.document import schema
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import load_study, paper_study, parse_study
-from studies.verify import commands, links, loops, machine, run, stepping, trajectories
+from studies.verify import commands, links, loops, machine, outside, run, stepping, trajectories
 from studies.verify.prepared import prepared
 from studies.verify.rows import Assumption, largest, worst, worst_relative
 from tests import TOP
@@ -416,6 +417,22 @@ def test_accelerations_of_the_modes_are_compared_like_those_of_the_pose(monkeypa
     whole = SimpleNamespace(_replace=lambda **_: None)
     accelerations, closure = machine._accelerations(paper_study(), structure, case, whole)
     assert accelerations.difference == pytest.approx(0.2) and closure.is_passed
+
+
+def test_residual_vibration_is_off_by_a_share_of_its_rms(monkeypatch):
+    """Of a made-up run that bends 2 % too far after the moves."""
+    time = np.arange(0.0, 0.3, 1e-3)
+    bent = 1e-4 * np.cos(300 * time)[:, None] * np.ones(3)
+    given = tables.FastMove(time, bent, np.zeros((300, 3)))
+    bends = np.zeros((3000, 3, 1))
+    bends[::10, :, 0] = np.where(time >= 0.2, 1.02, 1.0)[:, None] * bent
+    record = SimpleNamespace(chord_deflection_stations=bends, pose=np.zeros((3000, 3)))
+    monkeypatch.setattr(outside.tables, "fast_move", lambda: given)
+    monkeypatch.setattr(outside, "_record", lambda _: record)
+    rows = {row.assumption: row for row in outside._fast_move()}
+    after = rows["residual vibration after fast moves"]
+    assert after.difference == pytest.approx(0.02) and not after.is_passed
+    assert rows["platform in fast moves, on its drive"].is_passed
 
 
 @pytest.fixture
