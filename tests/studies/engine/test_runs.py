@@ -1,6 +1,7 @@
 """A single run: steps it needs, how it ends, statuses that must not read ok, ratios of its own."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -12,7 +13,7 @@ from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import _is_too_fast
 from jaxmodel.simulate import _share_on
 from studies import config
-from studies.engine.preflight import check_run
+from studies.engine.preflight import _check_load, check_run
 from studies.engine.runs import _simulate, run_study
 from studies.errors import StudyError
 from studies.study.cases import as_arrays, build_case, build_structure
@@ -189,3 +190,13 @@ def test_filters_beyond_half_the_sample_rate_are_too_fast_for_a_sampled_loop():
 
     assert not found(structure, case) and found(structure, fast)
     assert not found(structure._replace(feedback="ideal"), fast)
+
+
+def test_a_load_is_refused_for_the_link_that_it_compresses_most():
+    share = np.array([[0.5, 0.2, 0.1], [0.3, 1.5, 1.1]])  # of the critical force, by way-point
+    prepared = SimpleNamespace(steady_load=share, critical_force=np.array([10.0, 20.0, 30.0]))
+    with pytest.raises(
+        StudyError, match=r"critical force, 20 N \(here link 2: 30 N at way-point 2"
+    ):
+        _check_load(short_study(), prepared)
+    _check_load(short_study(), SimpleNamespace(steady_load=0.6 * share))

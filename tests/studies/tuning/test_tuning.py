@@ -23,6 +23,7 @@ from studies.tuning.evaluate import Evaluation
 from studies.tuning.folder import load_progress, save_progress
 from studies.tuning.linear_fidelity import BATCH, LinearFidelity
 from studies.tuning.loop_figures import machine_figures
+from studies.tuning.objective import baseline_limits
 from studies.tuning.optimise import (
     _fresh_progress,
     _hand_on,
@@ -533,3 +534,8 @@ def test_checked_derivatives_of_loaded_links_come_to_an_end():
     """
     for _ in range(4):
         subprocess.run([sys.executable, "-c", textwrap.dedent(code)], check=True, timeout=150)
+
+
+def test_without_limits_there_are_none_of_the_baseline():
+    found = baseline_limits(SimpleNamespace(limits=()), {"residual_rms": np.ones((3, 2))})
+    assert found.shape == (3, 0)

@@ -16,8 +16,9 @@ from studies.engine.preflight import check_run
 from studies.errors import StudyError
 from studies.reference.tables import frequencies
 from studies.show.document import json_text, schema
+from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study
-from studies.twin import compare, margin, report
+from studies.twin import compare, margin, plan, report
 from studies.twin import run as twin_run
 from studies.twin.chain import close_chain
 from studies.twin.electronics import SensorFilter
@@ -217,6 +218,31 @@ def test_without_exudyn_one_sentence_says_what_to_install(capsys, monkeypatch, t
 def test_what_the_twin_cannot_repeat_is_refused(fields, named):
     with pytest.raises(StudyError, match=f"{named} = .*allowed: .*studies twin"):
         compare.check_supported(Study().change(**fields))
+
+
+def test_steps_of_the_integrator_are_as_asked_or_about_ten_microseconds(monkeypatch):
+    asked = []
+
+    def begin(structure, case):
+        asked.append(structure.substeps)  # one for the reference, two of the integrator
+        raise StopIteration
+
+    monkeypatch.setattr(plan, "_begin", begin)
+    structure, case = build_structure(Study()), build_case(Study())
+    for settings in (Settings(), Settings(n_steps=4)):
+        with pytest.raises(StopIteration):
+            plan.plan_run(structure, case, settings, 0.1)
+    assert asked == [5, 2]
+
+
+def test_each_link_has_the_damping_ratios_of_its_own_modes():
+    ratios = ((0.01, 0.02), (0.03,), (0.04, 0.05))
+    study = Study().change(link__damping_ratio=ratios)
+    links = describe_machine(build_structure(study), as_arrays(build_case(study))).links
+    for link, wanted in zip(links, ratios, strict=True):
+        assert link.damping.ratio.shape[0] == link.damping.count.size == 1
+        count = int(link.damping.count[0])
+        assert tuple(link.damping.ratio[0, :count]) == wanted
 
 
 def test_a_run_that_ends_with_its_motion_is_refused():
