@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 
 import studies
+from jaxmodel.state_space import StateSpace
 from studies.engine.controller import fixed_controller
 from studies.export import run as export_run
 from studies.export import sequences, targets
 from studies.export.compiler import STRICT
-from studies.export.document import document, import_study, study_hash
+from studies.export.document import _of_system, document, import_study, study_hash
 from studies.export.verify import AIM
 from studies.study.spec import load_study, paper_study
 from tests import TOP
@@ -417,6 +418,13 @@ def test_designs_of_a_tuning(capsys, designs, tmp_path):
 def test_document_names_the_case_of_a_sweep(designs):
     found = fixed_controller(load_study(designs["paper"]))
     assert document(found, "0123456789abcdef").case_id == "0123456789abcdef"
+
+
+def test_a_system_s_anti_windup_is_described_where_it_has_one():
+    system = StateSpace(*(np.zeros((1, 1, 1, 1)) for _ in range(3)), np.zeros((1, 1, 1)))
+    assert "anti_windup" not in _of_system(system)
+    told = _of_system(system._replace(anti_windup=np.full((1, 1, 1, 1), 0.5)))
+    assert told["anti_windup"].value == [[[[0.5]]]]
 
 
 def test_headers_count_links_from_1():

@@ -6,13 +6,15 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from rich.console import Console
 
 from jaxmodel.loop import step
+from jaxmodel.shaper import Taps
 from studies.engine.channels import fold, unfold
 from studies.engine.controller import fixed_controller
 from studies.errors import StudyError
 from studies.export import fixed as fixed_point
-from studies.export import in_the_loop
+from studies.export import in_the_loop, targets
 from studies.export.c_fixed import fixed_source
 from studies.export.c_floating import floating_source
 from studies.export.compiler import compiled
@@ -29,8 +31,14 @@ from studies.export.fixed_blocks import design_integers
 from studies.export.floating import respond as respond_floating
 from studies.export.in_the_loop import LoopRun, replay
 from studies.export.integers import respond
-from studies.export.job import check_loop
-from studies.export.verify import Check, Verification, reference_run, vibration
+from studies.export.job import Job, check_loop
+from studies.export.verify import (
+    Check,
+    Verification,
+    _shape_reference,
+    reference_run,
+    vibration,
+)
 from studies.study.spec import parse_study
 from tests.exports import KINDS, PAPER, SINGLE, TUNED, changed, found_and_codes, needs_compiler
 
@@ -169,6 +177,12 @@ def test_fixed_shaper_leaves_a_pose_at_rest_where_it_is(shaper):
     np.testing.assert_allclose(row.values[0], found.taps.weight, rtol=0, atol=1e-8)
 
 
+def test_a_shaped_path_is_the_weighted_sum_of_its_past():
+    taps = Taps(np.array([0.75, 0.25]), np.array([0, 2]))
+    path = np.array([[0.0], [4.0], [8.0], [8.0]])
+    assert _shape_reference(taps, path).tolist() == [[0.0], [3.0], [6.0], [7.0]]
+
+
 def test_peak_gains_are_those_of_the_filters():
     channels = found_and_codes(PAPER)[0].channels
     gains = peak_gains(channels, 3000)
@@ -290,12 +304,13 @@ def test_factors_beyond_a_word_are_refused():
         fixed_point.find_row(np.array([[np.nan, 1.0]]), "gains", 32)
 
 
-def test_unstable_loops_are_refused_with_their_margin():
+def test_unstable_loops_are_refused_with_their_margin(monkeypatch):
     found = fixed_controller(parse_study(changed(PAPER, control={"gain_factor": 4.0})))
-    with pytest.raises(
-        StudyError, match=r"gain_factor = 4.0; .* spectral radius is 1\.\d+.*margin"
-    ):
-        check_loop(found, found.channels, "")
+    job = Job(found, "name", [], "", [], False, 16, Console(quiet=True), None)
+    message = r"gain_factor = 4.0; .* is stable: its spectral radius is 1\.\d+.*margin"
+    monkeypatch.setattr(targets, "reference_motion", None)  # refused before any motion
+    with pytest.raises(StudyError, match=message):
+        targets.TARGETS["c-fixed"].make(job)
     # a design that is stable, until its filters are rounded to a few bits
     found = fixed_controller(parse_study(PAPER))
     assert check_loop(found, found.channels, "").is_stable

@@ -306,6 +306,24 @@ def pair(folder, **changed):
     return problem, shape(describe_fit(problem, solve(problem, 4, 1, 60, 0).best.u))
 
 
+def test_each_starting_point_is_followed_once():
+    """Of two valleys, the study is in the better one and the point drawn, at 0.85, in the other."""
+
+    def residual(u):
+        return np.append((u - 0.2) * (u - 0.8), 0.01 * (u - 0.2))
+
+    problem = SimpleNamespace(
+        free=SimpleNamespace(places=lambda: np.array([0.21]), numbers=()),
+        bench=SimpleNamespace(study=SimpleNamespace(n_links=3)),
+        measurements=(),
+        costs=lambda places: np.array([0.5 * np.sum(residual(u) ** 2) for u in places]),
+        residual=residual,
+        jacobian=lambda u: np.array([2 * u - 1, [0.01]]),
+    )
+    found = solve(problem, starts=2, refine=2, iterations=60, seed=0)
+    assert [float(x.u[0]) for x in found.optima] == pytest.approx([0.2, 0.8], abs=1e-3)
+
+
 def test_posterior(folder):
     """Its derivatives; machines drawn from its shape."""
     problem, about = pair(folder, damping_sigma=0.0015)

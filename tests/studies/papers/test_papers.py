@@ -4,7 +4,7 @@ import json
 import re
 from functools import partial
 from types import SimpleNamespace
-from unittest.mock import patch
+from unittest.mock import MagicMock, patch
 
 import jsonschema
 import numpy as np
@@ -143,6 +143,14 @@ def test_one_mode_per_link_is_enough(tmp_path):
     rows = np.array([row[1:] for row in result.tables["modes"].rows], float)
     np.testing.assert_allclose(rows[::2, 1:], rows[1::2, 1:], rtol=0.01)
     assert "depends on the coupling ratio" in result.verdicts[1].outcome
+
+
+def test_progress_of_the_study_ends_with_its_work():
+    shares = []
+    parts = ("_baseline", "_sampled", "_nearest", "damping_map", "confirm")
+    with patch.multiple(findings, **{name: MagicMock() for name in parts}):
+        findings.find(rrr_card.EFFORT, lambda _, share: shares.append(share))
+    assert sum(shares) == rrr_card.CARD.work
 
 
 def test_the_first_mode_of_each_link_is_plucked():

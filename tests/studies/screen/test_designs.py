@@ -4,6 +4,7 @@ import html
 import re
 import shutil
 import threading
+import tomllib
 import warnings
 from shlex import quote
 from unittest import mock
@@ -23,7 +24,7 @@ from studies.screen.report import margin_rows, quantile_rows, summary_lines, wri
 from studies.screen.run import LocalScreener, run_screen
 from studies.screen.selection import select
 from studies.screen.shards import axis_columns, screen_of
-from studies.screen.stored import BEST, TALLY, read_tally, write_tally
+from studies.screen.stored import BEST, TALLY, best_sweep, read_tally, write_tally
 from studies.screen.tally import (
     LEFT_OUT,
     Tally,
@@ -284,6 +285,12 @@ def test_kept_designs_are_a_sweep_with_the_same_ids(whole):
     np.testing.assert_array_equal(table.case_id, expected.case_id[order])
     np.testing.assert_array_equal(table.seed, expected.seed[order])
     assert spec.sweep.fidelity == "full"
+
+
+def test_kept_designs_of_a_linear_sweep_run_in_the_full_model():
+    spec = small_spec(SWEEP | {"fidelity": "linear"})
+    written = tomllib.loads(best_sweep(screen_of(spec), build_table(spec, np.arange(2))))
+    assert parse_sweep(written).sweep.fidelity == "full"
 
 
 def test_kept_designs_have_the_margins_of_the_sweep(whole, swept):

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 import studies
 from studies.show import pages
 from studies.show.figures import SMALL, WIDTH, is_wide, new_figure, styled
-from studies.show.pages import page
+from studies.show.pages import page, render
 from studies.study import spec as spec_module
 from studies.study.template import toml_text
 from tests.pages import (
@@ -97,6 +97,13 @@ def test_a_template_becomes_a_whole_page(fill_report):
     assert policy.startswith("default-src 'none'; img-src data:; style-src 'unsafe-inline'")
     assert "script" not in policy
     assert '<div class="table">\n<table>' in html and '<meta charset="utf-8">' in html
+
+
+def test_texts_are_escaped_in_pages_only(monkeypatch):
+    loader = DictLoader({"code.c": "/* {{ text }} */", "page.html": "<p>{{ text }}</p>"})
+    monkeypatch.setattr(pages._environment(), "loader", loader)
+    assert render("code.c", text='a < b & "c"') == '/* a < b & "c" */'
+    assert render("page.html", text="a < b & c") == "<p>a &lt; b &amp; c</p>"
 
 
 REPORTS = {x.parent.name: x for x in sorted(Path(studies.__file__).parent.glob("**/report.html"))}

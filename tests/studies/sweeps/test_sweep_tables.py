@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from jaxmodel import status
@@ -22,7 +23,7 @@ from studies.study.margin import LEFT_OUT
 from studies.sweeps.documents import best_document
 from studies.sweeps.dry_run import axis_rows
 from studies.sweeps.explore import _figure
-from studies.sweeps.plots import front
+from studies.sweeps.plots import _scale_ordinate, front
 from studies.sweeps.report import report
 from studies.sweeps.screening import check_screen, draw_screen
 from studies.sweeps.sensitivity import analyse, failure_causes
@@ -620,6 +621,17 @@ def test_the_front_joins_what_has_more_margin_or_less_vibration():
     (ax, *_) = front(usual(), "residual_rms").axes
     assert ax.lines[0].get_xdata().tolist() == [64.0, 9.0, 8.0, 5.0, 1.5]
     assert np.all(np.diff(ax.lines[0].get_ydata()) < 0)
+
+
+def test_an_outlier_of_many_cases_is_counted_instead_of_shown():
+    value = np.linspace(1.0, 2.0, 100)
+    for last, top, title in ((2.0, 2.05, ""), (9.0, 2.29, "1 above 2.29 not shown")):
+        value[-1] = last
+        ax = Figure().add_subplot()
+        ax.plot(value)
+        _scale_ordinate(ax, value)
+        assert ax.get_ylim()[1] == pytest.approx(top, abs=0.01)
+        assert ax.get_title(loc="right") == title
 
 
 # --- the report -----------------------------------------------------------------------------------
