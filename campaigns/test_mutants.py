@@ -166,15 +166,18 @@ def test_mutants_in_short(tmp_path):
     assert len(found) == 3
 
 
-def test_most_mutants_of_the_record_are_killed():
+@pytest.mark.parametrize("package", PACKAGES)
+def test_most_mutants_of_the_record_are_killed(package):
     """Survivors that few tests have judged yet included."""
-    rows = read(RECORD)
+    rows = {x: verdict for x, verdict in read(RECORD).items() if x.file.startswith(package)}
     count = Counter(verdict.outcome for verdict in rows.values())
-    del count["waiting"]  # to be judged
-    assert set(count) == {"killed", "survived", "equivalent"}
+    assert set(count) <= {"killed", "survived", "equivalent"}
     assert all(x.by for x in rows.values() if x.outcome in ("killed", "equivalent"))
-    judged = count["killed"] + count["survived"]
-    assert len(rows) >= 300 and count["killed"] >= 0.9 * judged
+    assert len(rows) >= 300 and count["killed"] >= 0.9 * (len(rows) - count["equivalent"])
+
+
+def test_every_large_module_of_the_physics_has_mutants():
+    rows = read(RECORD)
     texts = {x: y for x, y in SOURCES.items() if x.startswith("jaxmodel/")}
     large = {file for file, text in texts.items() if lines_of_code(text) >= 100}
     assert large <= {mutant.file for mutant in rows}

@@ -91,6 +91,15 @@ def bent_run(peak):
     return SimpleNamespace(result=result, study=paper_study(), bent=bent)
 
 
+def test_replays_are_counted_as_they_are_done():
+    def invalid(row):
+        raise StudyError("it cannot run alone")
+
+    done = []
+    assert replayed([4, 7, 9], invalid, lambda *count: done.append(count)) == ()
+    assert done == [(1, 3), (2, 3), (3, 3)]
+
+
 def test_a_case_and_its_baseline_are_drawn_by_the_larger_bending_from_the_end_of_the_move():
     still = Skeleton(np.zeros((1, 3, 2, 2)), *2 * [np.zeros((1, 3, 2))], np.zeros((1, 3, 9, 2)))
     with mock.patch.multiple(

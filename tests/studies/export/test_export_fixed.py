@@ -11,7 +11,7 @@ from rich.console import Console
 from jaxmodel.loop import step
 from jaxmodel.shaper import Taps
 from studies.engine.channels import fold, unfold
-from studies.engine.controller import fixed_controller
+from studies.engine.controller import _frequencies, fixed_controller
 from studies.errors import StudyError
 from studies.export import fixed as fixed_point
 from studies.export import in_the_loop, targets
@@ -39,7 +39,8 @@ from studies.export.verify import (
     reference_run,
     vibration,
 )
-from studies.study.spec import parse_study
+from studies.study.cases import build_structure
+from studies.study.spec import Study, parse_study
 from tests.exports import KINDS, PAPER, SINGLE, TUNED, changed, found_and_codes, needs_compiler
 
 RAIL = 100
@@ -219,6 +220,12 @@ def run_of(codes, rms):
     codes, count = np.array(codes)[:, None, None], len(codes)
     result = SimpleNamespace(metrics=SimpleNamespace(residual_rms=np.array(rms)))
     return LoopRun(codes, np.zeros((count, 1, 1)), np.zeros((count, 3)), result)
+
+
+def test_channels_have_the_frequencies_that_the_controller_believes():
+    hertz = np.array([[100.0, 400.0], [110.0, 440.0], [120.0, 480.0]])
+    structure = build_structure(Study().change(control__modes=2))
+    np.testing.assert_allclose(_frequencies(structure, 2 * np.pi * hertz), hertz, rtol=1e-15)
 
 
 def test_code_that_cannot_keep_up_is_said_with_the_rate_that_can():

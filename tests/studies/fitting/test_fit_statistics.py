@@ -94,7 +94,7 @@ def test_a_number_of_which_only_the_bounds_are_known_is_not_identifiable():
     width = np.array([2e10, 0.04])
     for share, said in ((UNKNOWN, "not identifiable"), (0.9 * UNKNOWN, "")):
         answer = SimpleNamespace(
-            values=width / 2, sigma=share * width, interval=np.outer(width, [0.1, 0.9])
+            values=0.4321 * width, sigma=share * width, interval=np.outer(width, [0.1, 0.9])
         )
         rows = value_rows(
             SimpleNamespace(
@@ -105,6 +105,7 @@ def test_a_number_of_which_only_the_bounds_are_known_is_not_identifiable():
             )
         )
         assert [row[-1] for row in rows] == [said] * 2
+        assert [row[1] for row in rows] == ["8.64e+09", "0.0173"]  # digits by the deviation
 
 
 @pytest.mark.parametrize(("size", "number"), [(1, 0), (2, 0), (2, 1)])
