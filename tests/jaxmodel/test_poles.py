@@ -17,7 +17,7 @@ from jaxmodel.prepare import design_controller
 from jaxmodel.status import OK, UNPLACEABLE
 from studies.engine.controller import fixed_controller
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
-from studies.engine.poles import PoleReport, _matched, difference, pole_rows
+from studies.engine.poles import PoleReport, _matched, _relative_distance, difference, pole_rows
 from studies.engine.results import read_sweep
 from studies.engine.runs import run_study
 from studies.engine.stability import loop_report
@@ -260,6 +260,12 @@ def test_what_cannot_be_placed_is_a_status(law, changes, code):
 def test_poles_that_make_no_sense_are_refused(control, message):
     with pytest.raises(StudyError, match=message):
         parse_study({"control": control})
+
+
+def test_poles_are_apart_by_the_larger_share_of_decay_and_frequency():
+    specified = np.array([-20 + 800j, -20 + 800j, -20 - 800j])
+    found = np.array([-30 + 800j, -22 + 960j, -20 - 800j])
+    np.testing.assert_allclose(_relative_distance(found, specified), [0.5, 0.2, 0.0])
 
 
 @pytest.mark.parametrize("kind", MECHANISMS)

@@ -58,6 +58,7 @@ from studies.papers.rrr_2016.energies import (
 )
 from studies.papers.rrr_2016.findings import Baseline, Effort, Kind, Sampled
 from studies.papers.rrr_2016.machines import baselines, one_study, sample, varied
+from studies.papers.rrr_2016.report import _falls_below
 from studies.papers.rrr_2016.thresholds import DAMPING, greatest_damping, threshold
 from studies.papers.run import run_card
 from studies.show.document import schema
@@ -561,3 +562,10 @@ def test_equally_well_without_exceptions_holds_or_fails():
     assert [one.outcome for one in geronel_card.judge(found)] == [HOLDS, HOLDS]
     loud = found._replace(gauge=9 * np.ones((3, 2, 2)))
     assert [one.outcome for one in geronel_card.judge(loud)] == [FAILS, FAILS]
+
+
+def test_damping_falls_below_a_limit_between_two_mass_ratios():
+    """Straight in logarithms."""
+    ratio, greatest = np.array([0.1, 1.0, 10.0]), np.array([0.8, 0.4, 0.1])
+    assert _falls_below(ratio, greatest, 0.2) == pytest.approx(10**0.5)
+    assert _falls_below(ratio, greatest, 0.05) == 10.0 and _falls_below(ratio, greatest, 0.9) == 0.0
