@@ -24,7 +24,7 @@ HIGHEST, LOWEST = 64.0, 1e-6
 #: What stands beside margins and proofs.
 LEFT_OUT = (
     "Left out of margins and proofs: a patch on one face also stretches its link. Two other codes "
-    "that have it put the margin of the default controller at 1.6 to 1.9; here it is 3.70."
+    "that have it put the default controller's margin at 1.6 to 1.9, where this program has 3.70."
 )
 
 
