@@ -28,9 +28,9 @@ WAYS = (
 AT_REST = 1e-4
 #: Initial distance of poles from one another and from poles of the function [1].
 ASIDE = 1e-4
-#: Energy share of an order in its undamped modes from which they are its poles' neighbours [1].
-#: Below it, the drives' damping decides which of the modes are the links'.
-CLEAR = 0.9
+#: A pole that control moves by less than this share of what it moves another one of its order by is
+#: taken for the root beside the pole without control, which was not multiplied out exactly.
+LEFT_BEHIND = 0.01
 #: Share of an order in the energy of its undamped modes above which its poles are beside them;
 #: below it, drives are as quick as the links, and damping decides which of the modes are theirs.
 CLEAR = 0.9
@@ -54,8 +54,11 @@ def damping_ratios(
     """
     ratios = np.full((len(n_links), n_orders), np.nan)
     for order, first in enumerate(_open_loop_poles(response, modes, n_orders)):
-        poles = _poles(response, order, first)
-        ratios[:, order] = least_controlled(-poles.real / np.abs(poles), n_links)
+        poles, own = _poles(response, order, first)
+        ratio, moved = -poles.real / np.abs(poles), np.abs(poles - own) / np.abs(own)
+        is_root = moved < LEFT_BEHIND * moved.max(axis=0)
+        least = least_controlled(ratio, n_links)
+        ratios[:, order] = np.where(np.any(is_root & (ratio >= least), axis=0), np.nan, least)
     return ratios
 
 
@@ -112,8 +115,8 @@ def _state(response: LoopResponse, k: Any) -> np.ndarray:
     return state[np.ix_(order, order)]
 
 
-def _poles(response: LoopResponse, order: int, guess: np.ndarray) -> np.ndarray:
-    """The poles of an order [1/s], complex, NaN where they were not found, (l, n)."""
+def _poles(response: LoopResponse, order: int, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The poles of an order with and without control [1/s], NaN where not found, (l, n) each."""
     square, decay = response.square[:, order], response.decay[:, order] / 2
     held = _pair(-decay + 1j * np.sqrt(square - decay**2))
     first = _poles_apart(guess, response.period)
@@ -123,7 +126,7 @@ def _poles(response: LoopResponse, order: int, guess: np.ndarray) -> np.ndarray:
     if len(again):
         remaining, start = jax.tree.map(lambda x: x[..., again], (response, own))
         poles[:, again], is_found[again] = _follow(remaining, start, WAYS[1])
-    return np.where(is_found, poles, np.nan)
+    return np.where(is_found, poles, np.nan), own.re + 1j * own.im
 
 
 def _follow(response: LoopResponse, own: Pair, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

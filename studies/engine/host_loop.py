@@ -75,9 +75,8 @@ def link_poles(state: np.ndarray, n_links: int, n_tracked: int) -> np.ndarray:
     upper = value.imag > 0
     value, factor = value[upper], (left.conj() * right)[:, upper]
     factor = (factor / factor.sum(axis=0)).real
-    pose, bending = factor[: 2 * n_links], factor[2 * n_links :]
-    orders = bending.reshape(2, n_links, -1, value.size).sum(axis=(0, 1))
-    share = np.vstack([pose.sum(axis=0), orders])
+    orders = factor[2 * n_links :].reshape(2, n_links, -1, value.size).sum(axis=(0, 1))
+    share = np.vstack([factor[: 2 * n_links].sum(axis=0), orders])
     place = np.repeat(np.arange(len(share)), n_links)
     which, at = linear_sum_assignment(share[place].T, maximize=True)
     order = np.full(value.size, -1)

@@ -144,7 +144,7 @@ def judge_loops(structure: Structure, cases: Case) -> LoopFigures:
             if len(rows):
                 rows = judge(rows, sweep)
         is_lost = np.isnan(figures.least_damping).any(axis=1) & (figures.gain_margin >= 1)
-        is_lost &= np.any(whole.control.link_mask > 0, axis=1)
+        is_lost &= whole.control.link_mask.any(axis=1)
         by_eigenvalues = partial(_judge_by_eigenvalues, structure, whole, figures)
         rows = np.flatnonzero(is_sharp | is_beyond | is_lost)
         with serial_blas():

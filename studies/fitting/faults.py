@@ -65,7 +65,7 @@ def fault_of(one: Measurement, values: np.ndarray, better: float) -> Fault | Non
     least = min((square for square, _ in rated), default=np.inf)
     if least * better > own:
         return None
-    return next(fault for square, fault in rated if square <= AS_GOOD * least)
+    return next((fault for square, fault in rated if square <= AS_GOOD * least), None)
 
 
 def _faults(one: Measurement, values: np.ndarray) -> Iterator[Fault]:
@@ -146,8 +146,7 @@ def _named_gains(one: G, values: np.ndarray) -> Iterator[Fault]:
 
 
 def _gain(one: G, values: np.ndarray, model: np.ndarray) -> Iterator[Fault]:
-    size = abs(_best_gain(one, model))
-    if size > 0:
+    if (size := abs(_best_gain(one, model))) > 0:
         yield Fault("its gain is wrong by a factor of {:.4g}", _times(one, values, size), 1 / size)
 
 

@@ -206,7 +206,7 @@ def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console:
     note = mark_note(data, cases, metrics[0])
     if note:
         console.print(note, soft_wrap=True)
-    if MARGIN in data.variables:
+    if MARGIN in data.variables and np.isfinite(data[MARGIN]).any():
         console.print(LEFT_OUT, soft_wrap=True)
     texts = margin_warning(data, cases), resolution_warning(data, cases, metrics[0])
     for warning in (*texts, unranked_text(data, metrics[0])):

@@ -3,6 +3,7 @@
 import copy
 import re
 from functools import partial
+from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
@@ -167,6 +168,11 @@ def test_a_mended_gain_leaves_the_chi_square_of_sound_data(folder, bench, entry,
     one.sigma = sigma  # from the model
     mended = fault_of(one, TRUE, BETTER).mended
     np.testing.assert_allclose(np.sum(mended.residual(TRUE, False).value ** 2), wanted, rtol=0.01)
+
+
+def test_a_measurement_without_a_number_has_no_fault():
+    lost = SimpleNamespace(residual=lambda *_: SimpleNamespace(value=np.array([np.nan, np.inf])))
+    assert fault_of(lost, TRUE, BETTER) is None
 
 
 def test_exchanged_channels_are_named(measured):

@@ -308,10 +308,10 @@ def test_cases_that_cannot_be_ranked_are_counted():
 def test_margins_are_shown_with_what_they_leave_out(capsys):
     data, shown = usual(), []
     without = {x: y for x, y in data.variables.items() if x != "gain_margin"}
-    for variables in (data.variables, without):
+    for variables in (data.variables, without, usual(gain_margin=np.full(8, np.nan)).variables):
         print_cases(replace(data, variables=variables), np.array([0]), ["residual_rms"], Console())
         shown.append(" ".join(capsys.readouterr().out.split()))
-    assert LEFT_OUT in shown[0] and LEFT_OUT not in shown[1]
+    assert [LEFT_OUT in text for text in shown] == [True, False, False]
 
 
 # --- failures -------------------------------------------------------------------------------------
