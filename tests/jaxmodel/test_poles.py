@@ -263,8 +263,8 @@ def test_poles_that_make_no_sense_are_refused(control, message):
 
 
 def test_poles_are_apart_by_the_larger_share_of_decay_and_frequency():
-    specified = np.array([-20 + 800j, -20 + 800j, -20 - 800j])
-    found = np.array([-30 + 800j, -22 + 960j, -20 - 800j])
+    specified = np.array([-600 + 800j, -600 + 800j, -600 - 800j])  # 1000 in size
+    found = np.array([-900 + 800j, -660 + 1000j, -600 - 800j])
     np.testing.assert_allclose(_relative_distance(found, specified), [0.5, 0.2, 0.0])
 
 
