@@ -9,7 +9,7 @@ from 3x3 matrices. docs/theory.md, "Gain margins of a batch". Shapes: structure 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -186,19 +186,24 @@ class AssembledModes(NamedTuple):
     growth: Array  # growth rate of an unstable rest, 0: stable [1/s], ()
 
 
+def pose_coupling(response: LoopResponse | PlantResponse, xp: Any = jnp) -> Array:
+    """Entries of the mass matrix between pose and links, G' of `assembled_modes`, (p, n R)."""
+
+    def side_by_side(x: Array) -> Array:
+        return xp.concatenate([x[i] for i in range(len(x))], axis=1)
+
+    enter, leave = side_by_side(response.enter), side_by_side(response.leave)
+    # entries of both have one sign; without coupling the pose does not feel the links at all
+    return xp.sign(leave) * xp.sqrt(xp.maximum(enter * leave, 0.0))
+
+
 def assembled_modes(response: LoopResponse | PlantResponse) -> AssembledModes:
     """Natural modes of pose and links: one symmetric eigenvalue problem.
 
     With modal masses 1 the mass matrix is (1 G'; G M) and its Cholesky factor (1 0; G C),
     C C' = M - G G', so that K reduces to (K_q, -K_q G'C'^-1; ., C^-1 (K_p + G K_q G') C'^-1).
     """
-
-    def side_by_side(x: Array) -> Array:
-        return jnp.concatenate([x[i] for i in range(len(x))], axis=1)
-
-    enter, leave = side_by_side(response.enter), side_by_side(response.leave)
-    # entries of both have one sign; without coupling the pose does not feel the links at all
-    drag = jnp.sign(leave) * jnp.sqrt(jnp.maximum(enter * leave, 0.0))
+    drag = pose_coupling(response)
     factor = jnp.linalg.inv(jnp.linalg.cholesky(response.mass - drag @ drag.T))
 
     def reduced(pose: Array, links: Array) -> Array:

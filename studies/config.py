@@ -299,7 +299,7 @@ def processor_text() -> str:
 def require_configured() -> None:
     """Raise StudyError unless `configure` has been called: JAX's default is single precision.
 
-    Nor in a process forked from one in which JAX has started: its threads are not there, and what
+    Also in a process forked from one in which JAX has started: its threads are not there, and what
     they were to compute would be waited for without end.
     """
     if not _is_configured:

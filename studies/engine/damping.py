@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxmodel.pairs import Pair
 from jaxmodel.pole_paths import OrderPoles, refine_closed_loop_poles, refine_open_loop_poles
-from jaxmodel.return_difference import AssembledModes, LoopResponse
+from jaxmodel.return_difference import AssembledModes, LoopResponse, pose_coupling
 from studies.engine.host_loop import link_poles
 from studies.engine.lanes import run_steps
 
@@ -74,10 +74,8 @@ def least_controlled(ratio: np.ndarray, n_links: np.ndarray) -> np.ndarray:
     return np.where(n_links > 0, least, np.nan)
 
 
-def _open_loop_poles(
-    response: LoopResponse, modes: AssembledModes, n_orders: int
-) -> list[np.ndarray]:
-    """About the poles of each order without control [1/s], NaN if overdamped, (l, n) each."""
+def _open_loop_poles(response: LoopResponse, modes: AssembledModes, n_orders: int) -> np.ndarray:
+    """About the poles of each order without control [1/s], NaN if overdamped, (orders, l, n)."""
     n_links, found = len(response.square), []
     is_clear = np.ones(response.square.shape[2], bool)
     for order in range(min(n_orders, response.square.shape[1])):
@@ -88,18 +86,16 @@ def _open_loop_poles(
         )
         found.append(-loss + 1j * np.sqrt(omega**2 - loss**2))
         is_clear &= share.min(axis=0) > CLEAR
+    poles = np.array(found)
     for k in np.flatnonzero(~is_clear & np.isfinite(modes.omega).all(axis=0)):
-        each = link_poles(_state(response, k), n_links, len(found))
-        for poles, own in zip(found, each, strict=True):
-            poles[:, k] = own
-    return found
+        poles[:, :, k] = link_poles(_state(response, k), n_links, len(poles))
+    return poles
 
 
 def _state(response: LoopResponse, k: Any) -> np.ndarray:
     """A of the plant of lane k in (X, X', q, q'), by the equations of `assembled_modes`."""
     response = jax.tree.map(lambda x: x[..., k], response)
-    enter, leave = (np.concatenate(x, axis=1) for x in (response.enter, response.leave))
-    drag = np.sign(leave) * np.sqrt(np.maximum(enter * leave, 0.0))
+    drag = pose_coupling(response, np)
     pose, modes = drag.shape
     n, none = pose + modes, np.zeros_like(drag)
     mass = np.block([[response.mass, drag], [drag.T, np.eye(modes)]])

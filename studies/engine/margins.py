@@ -118,9 +118,9 @@ def judge_loops(structure: Structure, cases: Case) -> LoopFigures:
     structure, cases = with_margin_modes(structure, cases)
     whole = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape[1:])), cases)
     # idle links cost nothing; one number for all cases, since each number has its own programs
-    most = max(1, int(np.sum(whole.control.link_mask > 0, axis=1).max()))
-    threads = len(hosts())
-    with ThreadPoolExecutor(threads) as pool:
+    n_links = np.sum(whole.control.link_mask > 0, axis=1)
+    most, threads = max(1, int(n_links.max())), len(hosts())
+    with serial_blas(), ThreadPoolExecutor(threads) as pool:
 
         def judge(rows: np.ndarray, sweep: FrequencySweep) -> np.ndarray:
             """Write the figures of these cases; returns the doubtful ones."""
@@ -144,11 +144,9 @@ def judge_loops(structure: Structure, cases: Case) -> LoopFigures:
             if len(rows):
                 rows = judge(rows, sweep)
         is_lost = np.isnan(figures.least_damping).any(axis=1) & (figures.gain_margin >= 1)
-        is_lost &= whole.control.link_mask.any(axis=1)
+        is_lost &= n_links > 0
         by_eigenvalues = partial(_judge_by_eigenvalues, structure, whole, figures)
-        rows = np.flatnonzero(is_sharp | is_beyond | is_lost)
-        with serial_blas():
-            deque(pool.map(by_eigenvalues, map(int, rows)), 0)
+        deque(pool.map(by_eigenvalues, map(int, np.flatnonzero(is_sharp | is_beyond | is_lost))), 0)
     return figures
 
 

@@ -18,7 +18,7 @@ from jaxmodel.mechanisms.contract import Mechanism
 from jaxmodel.piezo import VACUUM_PERMITTIVITY
 from jaxmodel.table import Table
 from studies.errors import StudyError, field_error, nearest, shown
-from studies.study.sizes import default_of
+from studies.study.sizes import defaults_of
 from studies.study.state_space import check_system
 
 if TYPE_CHECKING:
@@ -102,8 +102,9 @@ def check_mechanism(study: Study) -> None:
     mechanism, machine = study.mechanism, study.machine
     solid = {"platform_inertia"} if mechanism.n_pose == 3 else set()
     read = {"kind", "kinds", "platform_mass", *solid, *mechanism.reads}
+    default = defaults_of(type(study), mechanism, "machine")
     for leaf, value in machine:
-        if leaf not in read and value != default_of(type(study), mechanism, "machine", leaf):
+        if leaf not in read and value != default[leaf]:
             raise StudyError(
                 f"machine.{leaf} = {shown(value)}: machine.kind = {mechanism.name!r} has no such "
                 "part; leave it out"
@@ -172,10 +173,10 @@ def _check_poles(study: Study) -> None:
 
 def _check_damping(study: Study) -> None:
     """Check that nothing else decides poles and gains, and that modes still vibrate."""
-    control = study.control
+    control, default = study.control, defaults_of(type(study), study.mechanism, "control")
     for leaf in ("pole_decay", "pole_frequency_hz", "velocity_gain", "position_gain"):
         value = getattr(control, leaf)
-        if value != default_of(type(study), study.mechanism, "control", leaf):
+        if value != default[leaf]:
             raise StudyError(
                 f"control.{leaf} = {shown(value)}: control.damping = {shown(control.damping)} "
                 "decides the gains; leave one of them out"

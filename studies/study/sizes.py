@@ -95,17 +95,19 @@ def own_defaults(model: type[BaseModel], mechanism: Mechanism) -> dict[tuple[str
     return found
 
 
-def default_of(model: type[BaseModel], mechanism: Mechanism, section: str, leaf: str) -> Any:
-    """What a field has if nothing is written."""
-    plain = model.model_fields[section].annotation.model_fields[leaf].default  # type: ignore[union-attr]
-    return own_defaults(model, mechanism).get((section, leaf), plain)
+def defaults_of(model: type[BaseModel], mechanism: Mechanism, section: str) -> dict[str, Any]:
+    """What the fields of a section have if nothing is written."""
+    own, annotation = own_defaults(model, mechanism), model.model_fields[section].annotation
+    fields = getattr(annotation, "model_fields", {})
+    return {leaf: own.get((section, leaf), info.default) for leaf, info in fields.items()}
 
 
 def for_mechanism(data: dict[str, Any], model: type[BaseModel], old: Mechanism) -> dict[str, Any]:
     """A whole study's dictionary for another mechanism, without the defaults of the old one."""
+    before = own_defaults(model, old)
     data = {name: dict(x) if isinstance(x, dict) else x for name, x in data.items()}
-    for (section, leaf), *_ in _marked(model):
-        if data[section].get(leaf) == default_of(model, old, section, leaf):
+    for (section, leaf), default, _ in _marked(model):
+        if data[section].get(leaf) == before.get((section, leaf), default):
             del data[section][leaf]
     return data
 

@@ -24,12 +24,10 @@ from studies.sweeps.records import (
 )
 from studies.sweeps.sensitivity import Cause, failure_causes
 from studies.sweeps.show import (
-    margin_warning,
     ranked_cases,
     ranking,
+    ranking_warnings,
     requirement,
-    resolution_warning,
-    unranked_text,
 )
 
 
@@ -67,8 +65,6 @@ def best_document(data: SweepData, by: str, subject_to: str = "", count: int = 1
     """What `studies best` says; arguments and errors as `best_cases`."""
     name = by.removeprefix("-")
     cases, metrics = ranked_cases(data, by, subject_to, count), with_others(data, [name])
-    warnings = [margin_warning(data, cases), resolution_warning(data, cases, name)]
-    warnings.append(unranked_text(data, name))
     return {
         "by": name,
         "direction": direction(by),
@@ -79,7 +75,7 @@ def best_document(data: SweepData, by: str, subject_to: str = "", count: int = 1
         "cases": case_records(data, cases, metrics),
         "units": units(data, [*swept_names(data), *metrics]),
         "left_out": [x for x in status_records(data) if x["status"] != status.OK],
-        "warnings": [text for text in warnings if text],
+        "warnings": ranking_warnings(data, cases, name),
     }
 
 

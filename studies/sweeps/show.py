@@ -206,12 +206,20 @@ def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console:
     note = mark_note(data, cases, metrics[0])
     if note:
         console.print(note, soft_wrap=True)
-    if MARGIN in data.variables and np.isfinite(data[MARGIN]).any():
+    if _has_margins(data):
         console.print(LEFT_OUT, soft_wrap=True)
-    texts = margin_warning(data, cases), resolution_warning(data, cases, metrics[0])
-    for warning in (*texts, unranked_text(data, metrics[0])):
-        if warning:
-            console.print(f"[bold red]{escape(warning)}[/]", soft_wrap=True, markup=True)
+    for warning in ranking_warnings(data, cases, metrics[0]):
+        console.print(f"[bold red]{escape(warning)}[/]", soft_wrap=True, markup=True)
+
+
+def _has_margins(data: SweepData) -> bool:
+    return MARGIN in data.variables and bool(np.isfinite(data[MARGIN]).any())
+
+
+def ranking_warnings(data: SweepData, cases: np.ndarray, by: str) -> list[str]:
+    """What must be known before acting on the cases that a metric ranks first."""
+    texts = margin_warning(data, cases), resolution_warning(data, cases, by)
+    return [text for text in (*texts, unranked_text(data, by)) if text]
 
 
 def print_uncontrolled(data: SweepData, by: str, console: Console) -> None:
@@ -398,8 +406,8 @@ def requirement(data: SweepData, by: str, is_safe: bool = True) -> str:
         As much of that, as a condition, as any case with this metric meets; "" for nothing.
     """
     own = data.spec.screen.subject_to if data.spec.screen is not None else ""
-    has_margin = is_safe and MARGIN in data.variables and bool(np.isfinite(data[MARGIN]).any())
-    conditions = [x for x in (own, f"{MARGIN} >= {ENOUGH:g}" if has_margin else "") if x]
+    is_safe = is_safe and _has_margins(data)
+    conditions = [x for x in (own, f"{MARGIN} >= {ENOUGH:g}" if is_safe else "") if x]
     for condition in dict.fromkeys((" and ".join(map(_bracket, conditions)), *conditions)):
         try:
             ranked_cases(data, by, condition, 1)
