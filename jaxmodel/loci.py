@@ -61,15 +61,15 @@ def start_loci(value: Pair) -> Loci:
     )
 
 
-def follow_loci(response: LoopResponse, spread: Array, loci: Loci, station: FrequencyPoint) -> Loci:
+def follow_loci(constants: tuple[LoopResponse, Array], station: FrequencyPoint, loci: Loci) -> Loci:
     """Carry the eigenvalues to the next frequency.
 
     Args:
-        response: of the loop.
-        spread: see `evaluate_loop_gain`, one for each channel.
-        loci: so far.
+        constants: response of the loop; spread of `evaluate_loop_gain`, one for each channel.
         station: the next frequency.
+        loci: so far.
     """
+    response, spread = constants
     s = Pair(_growth(response) + jnp.zeros_like(station.omega), station.omega)
     shift = Pair(station.cosine, -station.sine) * (1 - RADIUS_TOLERANCE)
     loop_gain = evaluate_loop_gain(response, s, shift, spread)
@@ -153,15 +153,15 @@ def start_crossing(omega: Array, value: Array, cosine: Array, sine: Array) -> Ax
 
 
 def refine_crossing(
-    response: LoopResponse, known: KnownCrossing, crossing: AxisCrossing
+    constants: tuple[LoopResponse, KnownCrossing], _: tuple[()], crossing: AxisCrossing
 ) -> AxisCrossing:
     """A step of Newton's iteration on det(x - L(j omega)) = 0 for real omega and x.
 
     Args:
-        response: of the loop.
-        known: the point to divide out.
+        constants: response of the loop; the point to divide out.
         crossing: so far.
     """
+    response, known = constants
     omega, value, zero = crossing.omega, crossing.value, jnp.zeros_like(crossing.omega)
     one = jnp.ones_like(zero)
     shift = Pair(crossing.cosine, -crossing.sine) * (1 - RADIUS_TOLERANCE)

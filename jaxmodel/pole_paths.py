@@ -30,14 +30,16 @@ class OrderPoles(NamedTuple):
     step: Array  # size of the last step over that of the pole [1], (n,)
 
 
-def refine_open_loop_poles(response: LoopResponse, held: Pair, traced: OrderPoles) -> OrderPoles:
+def refine_open_loop_poles(
+    constants: tuple[LoopResponse, Pair], _: tuple[()], traced: OrderPoles
+) -> OrderPoles:
     """Refine the poles of an order of the uncontrolled machine.
 
     Args:
-        response: of the loop.
-        held: poles of the links with held ends [1/s], (n,).
+        constants: response of the loop; poles of the links with held ends [1/s], (n,).
         traced: so far.
     """
+    response, held = constants
 
     def function(s: Pair, shift: Pair) -> Pair:
         return evaluate_loop_gain(response, s, shift).pose_inverse.inverse()
@@ -46,16 +48,16 @@ def refine_open_loop_poles(response: LoopResponse, held: Pair, traced: OrderPole
 
 
 def refine_closed_loop_poles(
-    response: LoopResponse, own: Pair, traced: OrderPoles, inverse: Array
+    constants: tuple[LoopResponse, Pair], inverse: Array, traced: OrderPoles
 ) -> OrderPoles:
     """Refine the poles of an order of the closed loop.
 
     Args:
-        response: of the loop.
-        own: poles without control [1/s], (n,).
-        traced: so far.
+        constants: response of the loop; poles without control [1/s], (n,).
         inverse: 1/k [1], ().
+        traced: so far.
     """
+    response, own = constants
     level = Pair(inverse * jnp.ones_like(traced.step[0]), jnp.zeros_like(traced.step[0]))
 
     def function(s: Pair, shift: Pair) -> Pair:

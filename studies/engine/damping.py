@@ -16,8 +16,8 @@ from jaxmodel.return_difference import AssembledModes, LoopResponse, pose_coupli
 from studies.engine.host_loop import link_poles
 from studies.engine.lanes import run_steps
 
-#: Iterations to find the poles without control.
-SETTLING = 6
+#: Iterations to find the poles without control; twice as many more for those not `SETTLED`.
+SETTLING = 12
 #: Gain factors on the way to 1, one iteration each; the second path is for poles that did not
 #: converge on the first.
 WAYS = (
@@ -26,11 +26,11 @@ WAYS = (
 )
 #: A last step, as a share of the pole, that counts as converged.
 AT_REST = 1e-4
+#: The same for poles without control: beside one that is not multiplied out exactly lies a root
+#: that is none of the loop. Equal poles, as at home, halve their distance in each iteration.
+SETTLED = 1e-6
 #: Initial distance of poles from one another and from poles of the function [1].
 ASIDE = 1e-4
-#: A pole that control moves by less than this share of what it moves another one of its order by is
-#: taken for the root beside the pole without control, which was not multiplied out exactly.
-LEFT_BEHIND = 0.01
 #: Share of an order in the energy of its undamped modes above which its poles are beside them;
 #: below it, drives are as quick as the links, and damping decides which of the modes are theirs.
 CLEAR = 0.9
@@ -54,11 +54,8 @@ def damping_ratios(
     """
     ratios = np.full((len(n_links), n_orders), np.nan)
     for order, first in enumerate(_open_loop_poles(response, modes, n_orders)):
-        poles, own = _poles(response, order, first)
-        ratio, moved = -poles.real / np.abs(poles), np.abs(poles - own) / np.abs(own)
-        is_root = moved < LEFT_BEHIND * moved.max(axis=0)
-        least = least_controlled(ratio, n_links)
-        ratios[:, order] = np.where(np.any(is_root & (ratio >= least), axis=0), np.nan, least)
+        poles = _poles(response, order, first)
+        ratios[:, order] = least_controlled(-poles.real / np.abs(poles), n_links)
     return ratios
 
 
@@ -111,23 +108,30 @@ def _state(response: LoopResponse, k: Any) -> np.ndarray:
     return state[np.ix_(order, order)]
 
 
-def _poles(response: LoopResponse, order: int, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The poles of an order with and without control [1/s], NaN where not found, (l, n) each."""
+def _poles(response: LoopResponse, order: int, guess: np.ndarray) -> np.ndarray:
+    """The poles of an order [1/s], complex, NaN where they were not found, (l, n)."""
     square, decay = response.square[:, order], response.decay[:, order] / 2
     held = _pair(-decay + 1j * np.sqrt(square - decay**2))
-    first = _poles_apart(guess, response.period)
-    own = run_steps(_refine_open_loop_poles, (response, held), (), first, SETTLING).pole
-    poles, is_found = _follow(response, own, WAYS[0])
+    own = jax.tree.map(np.array, _poles_apart(guess, response.period))
+    moving: Any = slice(None)
+    for steps in (SETTLING, 2 * SETTLING):
+        at = jax.tree.map(lambda x, at=moving: x[..., at], (response, held, own))
+        settled = run_steps(refine_open_loop_poles, at[:2], (), at[2], steps)
+        for old, new in zip(jax.tree.leaves(own), jax.tree.leaves(settled), strict=True):
+            old[..., moving] = new
+        moving = np.flatnonzero(np.any(own.step > SETTLED, axis=0))
+    own.pole.re[:, moving] = np.nan
+    poles, is_found = _follow(response, own.pole, WAYS[0])
     again = np.flatnonzero(~is_found)
     if len(again):
-        remaining, start = jax.tree.map(lambda x: x[..., again], (response, own))
+        remaining, start = jax.tree.map(lambda x: x[..., again], (response, own.pole))
         poles[:, again], is_found[again] = _follow(remaining, start, WAYS[1])
-    return np.where(is_found, poles, np.nan), own.re + 1j * own.im
+    return np.where(is_found, poles, np.nan)
 
 
 def _follow(response: LoopResponse, own: Pair, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     start = _poles_apart(own.re + 1j * own.im, response.period)
-    last = run_steps(_refine_closed_loop_poles, (response, own), 1 / way, start, len(way))
+    last = run_steps(refine_closed_loop_poles, (response, own), 1 / way, start, len(way))
     is_found = np.all((last.step < AT_REST) & np.isfinite(last.pole.re), axis=0)
     return last.pole.re + 1j * last.pole.im, is_found
 
@@ -140,15 +144,3 @@ def _poles_apart(poles: np.ndarray, period: np.ndarray) -> OrderPoles:
 
 def _pair(x: np.ndarray) -> Pair:
     return Pair(np.ascontiguousarray(x.real), np.ascontiguousarray(x.imag))
-
-
-def _refine_open_loop_poles(
-    constants: tuple[LoopResponse, Pair], _: tuple[Any, ...], traced: OrderPoles
-) -> OrderPoles:
-    return refine_open_loop_poles(*constants, traced)
-
-
-def _refine_closed_loop_poles(
-    constants: tuple[LoopResponse, Pair], inverse: Any, traced: OrderPoles
-) -> OrderPoles:
-    return refine_closed_loop_poles(*constants, traced, inverse)

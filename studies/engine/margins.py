@@ -481,7 +481,7 @@ def _converge(
     known = jax.tree.map(lambda x: x[start.case], known)
     angle = start.omega * response.period
     guess = start_crossing(start.omega, start.value, np.cos(angle), np.sin(angle))
-    last = run_steps(_refine_crossing, (response, known), (), guess, NEWTON)
+    last = run_steps(refine_crossing, (response, known), (), guess, NEWTON)
     return last, (last.step < CONVERGED) & (last.value > 0) & np.isfinite(last.value)
 
 
@@ -504,16 +504,4 @@ def _follow_axis(
 ) -> Loci:
     angle = omega * response.period
     inputs = FrequencyPoint(omega, np.cos(angle), np.sin(angle), kind)
-    return run_steps(_follow_loci, (response, spread), inputs, start_loci(first), len(omega))
-
-
-def _follow_loci(constants: tuple[LoopResponse, Any], station: FrequencyPoint, loci: Loci) -> Loci:
-    response, spread = constants
-    return follow_loci(response, spread, loci, station)
-
-
-def _refine_crossing(
-    constants: tuple[LoopResponse, KnownCrossing], _: tuple[Any, ...], crossing: AxisCrossing
-) -> AxisCrossing:
-    response, known = constants
-    return refine_crossing(response, known, crossing)
+    return run_steps(follow_loci, (response, spread), inputs, start_loci(first), len(omega))

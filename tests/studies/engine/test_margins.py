@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -308,6 +309,14 @@ def test_modes_are_told_from_drives_as_quick_as_they():
         wanted = loop_report(structure, case, HOME).damping_ratio
         least = least_controlled(wanted.T, np.full(3, sum(links)))
         np.testing.assert_allclose(single_damping(study), least, rtol=2e-3)
+
+
+def test_weak_control_is_judged_without_eigenvalues():
+    """Equal links at home have equal poles, and weak gains hardly move them."""
+    with mock.patch("studies.engine.margins.loop_report") as by_eigenvalues:
+        for gain in (0.0, 1e-3, 1.0):
+            assert np.all(single_damping(STUDY.change(control__gain_factor=gain)) > 0.005)
+    assert not by_eigenvalues.called
 
 
 def single_damping(study):
