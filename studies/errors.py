@@ -35,8 +35,12 @@ class ResolutionWarning(UserWarning):
     """Values are compared that the controller cannot measure."""
 
 
+class DataWarning(UserWarning):
+    """A file of measurements holds other than its entry says."""
+
+
 #: Warnings that the command line prints as one line.
-OWN_WARNINGS = (NoKernelWarning, ModelWarning, CacheWarning, ResolutionWarning)
+OWN_WARNINGS = (NoKernelWarning, ModelWarning, CacheWarning, ResolutionWarning, DataWarning)
 
 
 def warn_of_model(text: str) -> None:

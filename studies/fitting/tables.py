@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 
 from studies.errors import StudyError, field_error, nearest, shown
+from studies.fitting.uff import Side, read_uff
 from studies.reading import LARGEST as LARGEST_FILE
 from studies.reading import open_hdf5, open_regular, read_bytes, read_text
 from studies.study.matlab import read_mat
@@ -21,11 +22,11 @@ from studies.study.matlab import read_mat
 FORMATS = (".csv", ".txt", ".h5", ".hdf5", ".mat", ".uff", ".unv")
 #: Larger numbers are none that an instrument reads.
 LARGEST = 1e30
-#: Columns that a function of a UFF file becomes, by its abscissa: 18 frequency [Hz], else time [s].
-_FREQUENCY = 18
 
 
-def read_columns(file: str, folder: Path, path: str) -> dict[str, np.ndarray]:
+def read_columns(
+    file: str, folder: Path, path: str, kind: str = "response", sides: Sequence[Side] = ()
+) -> dict[str, np.ndarray]:
     """Columns of a file by name, as text from CSV; `column` makes numbers of them.
 
     Args:
@@ -33,9 +34,10 @@ def read_columns(file: str, folder: Path, path: str) -> dict[str, np.ndarray]:
             (a struct), of UFF `file::number`.
         folder: where the file that names it is.
         path: where it is written, for messages.
+        kind, sides: what the header of a UFF function must not contradict, see `uff.read_uff`.
 
     Raises:
-        StudyError: unreadable, unknown format, no columns.
+        StudyError: unreadable, unknown format, no columns, or another quantity.
     """
     name, _, inside = file.partition("::")
     where = folder / name
@@ -49,7 +51,7 @@ def read_columns(file: str, folder: Path, path: str) -> dict[str, np.ndarray]:
         elif where.suffix.lower() == ".mat":
             columns = _from_matlab(where, inside)
         elif where.suffix.lower() in (".uff", ".unv"):
-            columns = _from_uff(where, inside, path)
+            columns = read_uff(where, inside, path, kind, sides)
         else:
             columns = _from_csv(where)
     except (OSError, ValueError, KeyError, csv.Error) as error:
@@ -210,27 +212,3 @@ def _from_matlab_hdf5(where: Path, group: str) -> dict[str, np.ndarray]:
                 if values.dtype.kind in "iufc":
                     columns[name] = _numbers(values)
         return columns
-
-
-def _from_uff(where: Path, number: str, path: str) -> dict[str, np.ndarray]:
-    try:
-        import pyuff
-    except ImportError:
-        raise StudyError(f"{path}: reading {where} needs pyuff; install the extra 'uff'") from None
-    read_bytes(where)  # not larger than a file may be
-    try:
-        sets = pyuff.UFF(str(where))
-        functions = np.flatnonzero(sets.get_set_types() == 58)
-        if not functions.size:
-            raise ValueError("has no function (type 58)")
-        index = int(number or 1) - 1
-        if not 0 <= index < functions.size:
-            raise ValueError(f"has functions 1 to {functions.size}")
-        dataset = sets.read_sets(int(functions[index]))
-    except Exception as error:  # of any kind, for a damaged file
-        raise ValueError(str(error) or "damaged") from error
-    promised, read = int(dataset.get("num_pts", len(dataset["data"]))), len(dataset["data"])
-    if promised != read:
-        raise ValueError(f"promises {promised} points and has {read}")
-    abscissa = "frequency_hz" if dataset["abscissa_spec_data_type"] == _FREQUENCY else "time"
-    return {abscissa: np.asarray(dataset["x"]), "value": np.asarray(dataset["data"])}

@@ -21,15 +21,21 @@ from studies.fitting.spec import (
     NoiseEntry,
     OutputEntry,
     PoseEntry,
+    ResponseEntry,
     ShakenEntry,
     ThinnedEntry,
 )
 from studies.fitting.tables import column, read_columns
+from studies.fitting.uff import Side
 from studies.study.cases import build_structure
 from studies.study.signals import INPUTS, OUTPUTS, Signal, parse_signal
 
 #: Rows of a measurement that a fit takes: a minute or two of work.
 MOST_ROWS = 20_000
+#: Derivatives of the output by its quantity.
+ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
+#: The same of outputs that have one quantity.
+GIVEN = {"accelerometer": 2, "motor": 0}
 
 
 class Models(NamedTuple):
@@ -82,9 +88,31 @@ def each(value: Any, count: int, path: str) -> np.ndarray:
     return np.broadcast_to(np.asarray(value, float), (count,)).copy()
 
 
+def unit_of(output: Signal, quantity: str) -> str:
+    """Unit of an output or of its derivative."""
+    order = 0 if output.kind in GIVEN else ORDERS[quantity]
+    return OUTPUTS[output.kind][1] + ("", "/s", "/s^2")[order]
+
+
+def _sides(spec: FitSpec, entry: FileEntry, path: str) -> list[Side]:
+    """What an entry says of its output, and of the input of a response."""
+    *source, output = signals_of(spec, entry, path)
+    names = ["outputs" if isinstance(entry, DecayEntry) else "output"]
+    if output.kind not in GIVEN:
+        names.insert(0, "quantity")
+    field = next(x for x in names if hasattr(entry, x))
+    unit = unit_of(output, getattr(entry, "quantity", "displacement"))
+    sides: list[Side] = [("ordinate", f"{path}.{field}", getattr(entry, field), unit)]
+    if isinstance(entry, ResponseEntry):
+        unit = INPUTS[source[0].kind][1]
+        sides.append(("orddenom", f"{path}.input", entry.input, unit))
+    return sides
+
+
 def reader(spec: FitSpec, entry: FileEntry, path: str) -> Callable[[str], np.ndarray]:
     """What reads a column; all that are read have one length."""
-    columns = read_columns(entry.file, spec.folder, f"{path}.file")
+    sides = _sides(spec, entry, path)
+    columns = read_columns(entry.file, spec.folder, f"{path}.file", entry.kind, sides)
     thin = entry.thin if isinstance(entry, ThinnedEntry) else 1
     thinned = {name: x[::thin] for name, x in columns.items()}
     lengths: dict[str, int] = {}

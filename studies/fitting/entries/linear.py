@@ -11,6 +11,8 @@ from studies.errors import StudyError, field_error
 from studies.fitting.decays import DecaySettings, decay_modes
 from studies.fitting.entries import common
 from studies.fitting.entries.common import (
+    GIVEN,
+    ORDERS,
     Models,
     ascending,
     each,
@@ -19,6 +21,7 @@ from studies.fitting.entries.common import (
     reader,
     real,
     signals_of,
+    unit_of,
     unknown,
 )
 from studies.fitting.kinds.contract import Measurement, Noise
@@ -40,14 +43,10 @@ from studies.fitting.spec import (
     ShakenEntry,
     SpectrumEntry,
 )
-from studies.study.signals import INPUTS, OUTPUTS, Signal
+from studies.study.signals import INPUTS, Signal
 
 #: Shapes whose largest voltage is below this have no direction [V].
 SMALLEST = 1e-100
-#: Derivatives of the output by its quantity.
-ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
-#: The same of outputs that have one quantity.
-GIVEN = {"accelerometer": 2, "motor": 0}
 
 
 def make_modes(spec: FitSpec, models: Models, entry: ModesEntry, path: str) -> Measurement:
@@ -159,7 +158,7 @@ def make_response(spec: FitSpec, models: Models, entry: ResponseEntry, path: str
         frequency,
         measured,
         noise_of(entry, measured, path),
-        _unit(signals, ORDERS[entry.quantity]),
+        _unit(signals, entry.quantity),
     )
     if entry.magnitude:
         return Magnitude(*arguments)
@@ -191,7 +190,7 @@ def make_record(spec: FitSpec, models: Models, entry: RecordEntry, path: str) ->
         found.frequency,
         found.value,
         Noise(found.sigma, entry.sigma_percent / 100),
-        _unit(signals, ORDERS[entry.quantity]),
+        _unit(signals, entry.quantity),
         unknown=unknown(entry.unknown),
     )
 
@@ -225,9 +224,8 @@ def _order(entry: ShakenEntry, signals: tuple[Signal, ...], path: str) -> int:
     return GIVEN[signals[1].kind]
 
 
-def _unit(signals: tuple[Signal, ...], order: int) -> str:
-    per = ("", "/s", "/s^2")[order]
-    return f"{OUTPUTS[signals[1].kind][1]}{per}/{INPUTS[signals[0].kind][1]}"
+def _unit(signals: tuple[Signal, ...], quantity: str) -> str:
+    return f"{unit_of(signals[1], quantity)}/{INPUTS[signals[0].kind][1]}"
 
 
 def make_spectrum(spec: FitSpec, models: Models, entry: SpectrumEntry, path: str) -> Measurement:
