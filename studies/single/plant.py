@@ -69,16 +69,26 @@ def plant_of(study: Study) -> NamedSystem:
     structure, case = check_run(study)
     pose = np.array(study.motion.waypoints[0], float)
     found = jax.tree.map(np.asarray, _plant(structure._replace(n_steps=1, substeps=1), case, pose))
+    a, b, c = _observed(found)
     actuators, sensors = _ports(structure)
     return NamedSystem(
-        a=found.state,
-        b=found.enter,
-        c=found.leave,
-        d=np.zeros((len(found.leave), found.enter.shape[1])),
+        a=a,
+        b=b,
+        c=c,
+        d=np.zeros((len(c), b.shape[1])),
         sample_time=1 / study.electronics.sample_rate_hz,
         inputs=actuators,
         outputs=sensors,
     )
+
+
+def _observed(plant: SampledPlant) -> SampledPlant:
+    """Without states that nothing depends on: commands older than the delay."""
+    a, b, c = plant
+    used = np.any(a, axis=0) | np.any(c, axis=0)
+    if used.all():
+        return plant
+    return _observed(SampledPlant(a[np.ix_(used, used)], b[used], c[:, used]))
 
 
 @kept_jit(static_argnums=0)

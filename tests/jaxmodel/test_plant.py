@@ -13,7 +13,7 @@ from studies.engine.preflight import check_run, preflight
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.export.in_the_loop import replay
-from studies.single.plant import controller_of, plant_of, write_system
+from studies.single.plant import _plant, controller_of, plant_of, write_system
 from studies.study.spec import parse_study
 from studies.study.template import study_template
 from tests.jaxmodel.kept import without_run
@@ -65,6 +65,30 @@ def test_a_command_is_seen_after_its_delay_and_bends_as_statics_says():
     still = np.linalg.solve(np.eye(len(plant.a)) - plant.a, plant.b)
     # statics of a pinned link: docs/theory.md, "Static correction"
     np.testing.assert_allclose((plant.c @ still)[np.arange(9), np.arange(9)], 0.050075, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "delay, later, count", [(0.0, 0.0, 0), (0.3, 0.0, 1), (0.7, 0.3, 1), (1.3, 0.0, 2), (3.0, 1, 4)]
+)
+def test_the_plant_has_the_commands_that_its_delay_needs(delay, later, count):
+    """As many a patch as samples begun, each controllable and observable, and nothing changed."""
+    study = parse_study(SHORT | {"electronics": {"delay": delay, "unmodelled_delay": later}})
+    plant = plant_of(study)
+    states = 6 + 2 * 9 + 2 * 9  # pose, three modes of three links, filters of nine sensors
+    assert len(plant.a) == states + 9 * count
+    order = len(plant.a)
+    for tested in (np.hstack([plant.a, plant.b]), np.vstack([plant.a, plant.c]).T):
+        rows = tested / np.abs(tested).max(axis=1, keepdims=True)
+        assert np.linalg.matrix_rank(rows) == order  # z I - A at z = 0
+    structure, case = check_run(study)
+    whole = _plant(structure._replace(n_steps=1, substeps=1), case, np.array(HOME))
+    a, b, c = map(np.asarray, whole)
+    assert len(a) == states + 9 * 4
+    reached = [plant.b, b]
+    for _ in range(400):  # samples after a pulse
+        wanted = c @ reached[1]
+        np.testing.assert_allclose(plant.c @ reached[0], wanted, rtol=0, atol=1e-10 * 0.05)
+        reached = [plant.a @ reached[0], a @ reached[1]]
 
 
 @pytest.mark.parametrize("end", ["npz", "mat", "json"])
