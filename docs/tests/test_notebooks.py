@@ -24,6 +24,7 @@ LONG = (
     "5_spillover",
     "6_from_design_to_c",
     "7_python_control",
+    "9_gauges_or_piezo",
 )
 #: Packages of an extra that a notebook needs.
 NEEDS = {"7_python_control": ("control", "ctrlsys")}
@@ -40,6 +41,7 @@ def test_there_are_notebooks():
         "6_from_design_to_c",
         "7_python_control",
         "8_other_machines",
+        "9_gauges_or_piezo",
     ]
 
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from studies.errors import field_error, nearest
+from studies.errors import StudyError, field_error, nearest
 from studies.papers.card import PaperCard
-from studies.papers.geronel_2025.card import CARD as GERONEL_2025
 from studies.papers.gupta_2010.card import CARD as GUPTA_2010
 from studies.papers.rrr_2016.card import CARD as RRR_2016
 from studies.papers.zhang_2016.card import CARD as ZHANG_2016
 
-CARDS: dict[str, PaperCard] = {
-    card.name: card for card in (ZHANG_2016, RRR_2016, GUPTA_2010, GERONEL_2025)
-}
+CARDS: dict[str, PaperCard] = {card.name: card for card in (ZHANG_2016, RRR_2016, GUPTA_2010)}
+#: Papers that a notebook examines.
+NOTEBOOKS = {"geronel_2025": "notebooks/9_gauges_or_piezo.ipynb"}
 
 
 def find_card(name: str) -> PaperCard:
@@ -20,6 +19,8 @@ def find_card(name: str) -> PaperCard:
     Raises:
         StudyError: there is none.
     """
+    if name in NOTEBOOKS:
+        raise StudyError(f"NAME = {name!r}: no card; see {NOTEBOOKS[name]}")
     if name not in CARDS:
         begun = next((card for card in CARDS if name and card.startswith(name.lower())), "")
         raise field_error("NAME", name, ", ".join(CARDS), hint=begun or nearest(name, CARDS))

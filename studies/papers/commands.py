@@ -24,7 +24,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     ) -> None:
         """Test what a paper claims: outcome of each claim, data, figures, open numbers."""
         start(precision)
-        from studies.papers.catalogue import CARDS, find_card
+        from studies.papers.catalogue import CARDS, NOTEBOOKS, find_card
         from studies.papers.run import run_card
 
         if name:
@@ -37,3 +37,5 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             raise StudyError(f"NAME: missing; allowed: {', '.join(CARDS)}")
         for one in CARDS.values():
             console.print(f"{one.name}: {one.title}", soft_wrap=True)
+        for paper, notebook in NOTEBOOKS.items():
+            console.print(f"{paper}: {notebook}", soft_wrap=True)

@@ -12,16 +12,9 @@ import pytest
 import scipy
 from rich.console import Console
 
-from jaxmodel.piezo import actuator_constant, sensor_constant
+from jaxmodel.piezo import actuator_constant
 from studies.papers.card import FAILS, HOLDS, depends_on, outcome_of
-from studies.papers.catalogue import CARDS
-from studies.papers.geronel_2025 import card as geronel_card
-from studies.papers.geronel_2025 import comparison as geronel_comparison
-from studies.papers.geronel_2025.comparison import (
-    SensorComparison,
-    matched_gain,
-    noise_limit,
-)
+from studies.papers.catalogue import CARDS, NOTEBOOKS
 from studies.papers.gupta_2010 import card as gupta_card
 from studies.papers.gupta_2010.closed_loop import MODES, ClosedLoops, close_loops
 from studies.papers.gupta_2010.criteria import (
@@ -64,7 +57,7 @@ from studies.papers.run import run_card
 from studies.show.document import schema
 from studies.study.cases import build_case
 from studies.study.spec import paper_study
-from tests.canonical import MACHINE, study_of
+from tests import TOP
 from tests.pages import text_of
 from tests.studies.test_cli import refused, run
 
@@ -72,7 +65,9 @@ from tests.studies.test_cli import refused, run
 def test_cards_are_listed(capsys):
     code, out, err = run(capsys, "paper")
     assert (code, err) == (0, "")
-    assert [line.partition(":")[0] for line in out.splitlines()] == list(CARDS)
+    assert [line.partition(":")[0] for line in out.splitlines()] == [*CARDS, *NOTEBOOKS]
+    for path in NOTEBOOKS.values():
+        assert path in out and (TOP / path).exists()
 
 
 @pytest.mark.parametrize(
@@ -81,6 +76,7 @@ def test_cards_are_listed(capsys):
         (("zhang_2061", "--out", "OUT"), "NAME = 'zhang_2061'; allowed: .*did you mean 'zhang_201"),
         (("rrr",), "NAME = 'rrr'; allowed: .*did you mean 'rrr_2016'?"),
         (("zhang_2016",), "--out: missing"),
+        (("geronel_2025", "--out", "OUT"), "no card; see notebooks/9_gauges"),
         (("--out", "OUT"), "NAME: missing; allowed: zhang_2016"),
     ],
 )
@@ -460,108 +456,6 @@ def test_placement_card_writes_a_whole_folder(tmp_path):
     data = [*(f"{name}.csv" for name in result.tables), "claims.json"]
     assert sorted(x.name for x in tmp_path.iterdir()) == sorted([*data, *images, "report.html"])
     assert {one.outcome for one in result.verdicts} <= {HOLDS, FAILS}
-
-
-# --- geronel_2025 ---------------------------------------------------------------------------------
-
-
-def test_gauges_give_the_voltage_of_piezo_sensors():
-    study = paper_study()
-    gauges = study.change(patches__sensor="strain_gauge", patches__gauge_gain=matched_gain(study))
-    piezo, gauge = (
-        np.asarray(sensor_constant(one.beam, one.patches))
-        for one in (build_case(study).machine, build_case(gauges).machine)
-    )
-    np.testing.assert_allclose(gauge, piezo, rtol=1e-9)
-
-
-def test_noise_limit_of_a_known_course():
-    """A ratio that grows with the logarithm of noise: 1.1 between 1 and 1.2 is half-way."""
-    noise = np.array([1e-7, 1e-6, 1e-5])
-    assert noise_limit(noise, np.array([1.0, 1.0, 1.2]), 1.1) == pytest.approx(10**-5.5)
-    assert np.isnan(noise_limit(noise, np.ones(3), 1.1))
-    assert np.isnan(noise_limit(noise, 2 * np.ones(3), 1.1))
-
-
-SENSORS = (1e-8, 1e-6, 3e-5)
-
-
-@pytest.mark.long  # in short: the whole folder of runs that are made up, below
-def test_sensor_card_tells_what_decides():
-    result = geronel_card.evaluate(SENSORS, (0,), lambda *_: None)
-    assert result.verdicts[0].outcome == HOLDS
-    assert "gauges' amplifiers" in result.verdicts[1].outcome
-    limits = [float(row[4]) for row in result.tables["limits"].rows]
-    assert limits == sorted(limits, reverse=True)
-
-
-def left(modulus, noise=0.0, seed=0, is_free=False):
-    """Residual vibration that softer links with less noise leave [m]."""
-    ends = 1e-6 / modulus  # noise that adds as much as there is
-    return 1e-6 / modulus * (1 if is_free else 0.1 * np.hypot(1 + 0.01 * seed, noise / ends))
-
-
-def test_sensor_card_writes_a_whole_folder(tmp_path):
-    """Of runs that are made up: each has the number of its links, its noise and its seed."""
-    base = study_of(MACHINE, metrics__residual_length=0.01)
-    gain = matched_gain(base)
-
-    def run(_, cases, on_progress):
-        rms = []
-        for case in cases:
-            machine = case.machine
-            modulus = np.max(machine.beam.youngs_modulus) / base.link.youngs_modulus
-            is_free = not np.any(case.control.link_mask)
-            assert machine.patches.is_gauge or not machine.patches.gauge_noise
-            noise = machine.patches.gauge_noise / gain
-            rms.append(np.full((3, 1), left(modulus, noise, case.seed, is_free)))
-        metrics = SimpleNamespace(residual_rms=np.array(rms))
-        return SimpleNamespace(status=np.zeros(len(cases)), metrics=metrics)
-
-    small = geronel_card.CARD._replace(run=partial(geronel_card.evaluate, SENSORS, (0, 1)))
-    with (
-        patch.object(geronel_comparison, "paper_study", lambda: base),
-        patch.object(geronel_comparison, "run_batches", run),
-    ):
-        result = run_card(small, tmp_path, Console(quiet=True))
-    images = [*(f"{name}.png" for name in result.figures), "machine.png"]
-    data = [*(f"{name}.csv" for name in result.tables), "claims.json"]
-    assert sorted(x.name for x in tmp_path.iterdir()) == sorted([*data, *images, "report.html"])
-    assert result.verdicts[0].outcome == HOLDS
-    assert "gauges' amplifiers" in result.verdicts[1].outcome
-    moduli = (0.5, 1.0, 2.0)
-    assert [row[1:] for row in result.tables["runs"].rows] == [
-        [f"{noise:.6g}", str(seed + 1), f"{left(modulus, noise, seed):.6g}"]
-        for modulus in moduli
-        for noise in SENSORS
-        for seed in (0, 1)
-    ]
-    for row, modulus in zip(result.tables["limits"].rows, moduli, strict=True):
-        assert float(row[1]) == pytest.approx(1e6 * left(modulus, is_free=True), rel=0.01)
-        both = np.mean([left(modulus, seed=seed) for seed in (0, 1)])
-        assert float(row[2]) == pytest.approx(1e6 * both, rel=0.01)
-        assert float(row[3]) == pytest.approx(1e6 * both, rel=0.01)
-    hz = [float(row[0]) for row in result.tables["limits"].rows]
-    np.testing.assert_allclose(hz, np.array([0.5, 1, 2]) ** 0.5 * hz[1], rtol=1e-3)
-    limits = [float(row[4]) for row in result.tables["limits"].rows]
-    assert limits == sorted(limits, reverse=True) and len({*limits}) == 3
-
-
-def test_equally_well_without_exceptions_holds_or_fails():
-    ones = np.ones((3, 2))
-    found = SensorComparison(
-        study=None,
-        frequency=np.array([80.0, 110.0, 160.0]),
-        gain=1.0,
-        noise=np.array([1e-7, 1e-6]),
-        free=10 * np.ones(3),
-        piezo=ones,
-        quiet=ones,
-        gauge=np.ones((3, 2, 2)),
-    )
-    assert [one.outcome for one in geronel_card.judge(found)] == [HOLDS, HOLDS]
-    loud = found._replace(gauge=9 * np.ones((3, 2, 2)))
-    assert [one.outcome for one in geronel_card.judge(loud)] == [FAILS, FAILS]
 
 
 def test_damping_falls_below_a_limit_between_two_mass_ratios():
