@@ -14,6 +14,7 @@ To add one: a function of a link's data that returns `ModalBasis`, and its entry
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -21,7 +22,14 @@ import numpy as np
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array, Beam, Patches
 from jaxmodel.piezo import bare_stiffness, patch_ends
-from jaxmodel.static import Pieces, bent_at, link_pieces, section_stiffness, static_bending
+from jaxmodel.static import (
+    Pieces,
+    bent_at,
+    link_pieces,
+    section_stiffness,
+    static_bending,
+    static_loads,
+)
 from jaxmodel.table import Table
 
 _Parts = TypeVar("_Parts", Beam, Patches)
@@ -126,6 +134,27 @@ def mask_modes(basis: ModalBasis, mode_mask: Array) -> ModalBasis:
         sensor_slope=basis.sensor_slope * mask[:, None],
         actuator_slope=basis.actuator_slope * mask[:, None],
     )
+
+
+def left_out_of_loads(
+    kind: str, beam: Beam, patches: Patches, stations: Array, basis: ModalBasis
+) -> Array:
+    """What the modes of a basis leave out of the static response to loads.
+
+    Args:
+        kind, beam, patches, stations, basis: as `build_basis` took and returned them.
+
+    Returns:
+        As `static_loads` of each link, less the share of the modes, (3, 2 K + S, S + 2).
+    """
+    n_links = len(basis.mass)
+    own = _each_link(patches._replace(center=0.0), n_links)._replace(center=patches.center)
+    loads = partial(static_loads, has_patches=BASES[kind].has_patches)
+    exact = jax.vmap(loads)(_each_link(beam, n_links), own, stations)
+    slopes = [jnp.swapaxes(x, 1, 2) for x in (basis.sensor_slope, basis.actuator_slope)]
+    seen = jnp.concatenate([slopes[0], basis.deflection_at, slopes[1]], axis=1)
+    forces = [jnp.swapaxes(basis.deflection_at, 1, 2), basis.b[..., None], basis.c[..., None]]
+    return exact - seen @ (jnp.concatenate(forces, axis=2) / basis.stiffness[..., None])
 
 
 def held_frequency(kind: str, beam: Beam, basis: ModalBasis) -> Array:

@@ -11,7 +11,7 @@ from functools import partial
 from typing import NamedTuple
 
 from jaxmodel.bases import station_places
-from jaxmodel.beam import build_basis, held_frequency
+from jaxmodel.beam import build_basis, held_frequency, left_out_of_loads
 from jaxmodel.case import Case, Structure
 from jaxmodel.drive import Reference
 from jaxmodel.drives import DRIVES
@@ -21,26 +21,31 @@ from jaxmodel.lazy import jax, jnp
 from jaxmodel.linear import flatten, linearise, resting
 from jaxmodel.loop import Loop, PlantState, plant_rates
 from jaxmodel.parameters import Array
+from jaxmodel.piezo import actuator_constant, sensor_constant
 from jaxmodel.plant import damping_ratio
-from jaxmodel.prepare import prepare
+from jaxmodel.prepare import Prepared, prepare
 
 
 class BenchPlant(NamedTuple):
-    """x' = A x + B u, y = C x + D u, with x = (X, X', q, q') about rest, (n,)."""
+    """x' = A x + B_0 u + B_2 u'', y = C x + D u, with x = (X, X', q, q') about rest, (n,).
+
+    B_2: modes that are left out follow their forces at once, and their inertia moves the pose.
+    """
 
     state: Array  # A [1/s and mixed], (n, n)
-    actuator: Array  # B of the voltages on the actuators, (n, 3 K)
-    slider_force: Array  # B of forces on the actuated joints, (n, 3)
-    hammer: Array  # B of forces across the links at the stations, (n, 3 S)
+    actuator: Array  # (B_0, B_2) of the voltages on the actuators, (2, n, 3 K)
+    slider_force: Array  # of forces on the actuated joints, (2, n, 3)
+    hammer: Array  # of forces across the links at the stations, (2, n, 3 S)
     sensor: Array  # voltages of the sensors [V], (3 K, n)
     deflection: Array  # chord deflection at the stations [m], (3 S, n)
     across: Array  # of a point at a station in the plane, across its link [m], (3 S, n)
     along: Array  # the same along its link [m], (3 S, n)
     slider: Array  # actuated coordinates [m], (3, n)
     pose: Array  # [m, m, rad], (3, n)
-    # D, of the modes that are left out; zero for all other pairs
-    actuator_to_sensor: Array  # [V/V], (3 K, 3 K)
-    actuator_to_deflection: Array  # [m/V], (3 S, 3 K)
+    # D of sensors [V], then of deflections [m], by the modes that are left out; 0 for other outputs
+    from_actuator: Array  # (3 (K + S), 3 K)
+    from_slider_force: Array  # (3 (K + S), 3)
+    from_hammer: Array  # (3 (K + S), 3 S)
     drive: Array  # proportional and derivative gain of the drives [N/m, N s/m], (2, 3)
 
 
@@ -55,7 +60,8 @@ def bench_plant(structure: Structure, case: Case, pose: Array) -> BenchPlant:
     Returns:
         BenchPlant.
     """
-    loop = prepare(structure, case).loop
+    prepared = prepare(structure, case)
+    loop = prepared.loop
     pose = jnp.asarray(pose, loop.omega.dtype)
     plant = linearise(structure, loop, pose, resting(structure, case))
     still = jnp.zeros_like(pose)
@@ -68,20 +74,65 @@ def bench_plant(structure: Structure, case: Case, pose: Array) -> BenchPlant:
     to_pose = jnp.pad(jnp.eye(n), others)
     across, along = jax.jacfwd(partial(_point_rates, loop, station_places(case), pose))(still)
     gains = drive_gains(DRIVES[structure.drive], loop.drive)
+    hammer, wrench = _forces(structure, loop, case, pose)
+    to_sensor, to_deflection = plant.direct_sensor, plant.direct_deflection
+    left_out = _left_out(structure, case, prepared, pose)
+    # X'' is what is moved: the second part of x' = (X', X'', ..)
+    by_motion = left_out.by_motion @ jnp.eye(n, len(plant.state), n)
+    moved = by_motion @ plant.state
+    deflection = plant.deflection + moved[len(to_sensor) :]
     return BenchPlant(
         state=plant.state,
-        actuator=plant.voltage,
-        slider_force=plant.force,
-        hammer=_hammer(structure, loop, case, pose),
-        sensor=plant.sensor,
-        deflection=plant.deflection,
-        across=jnp.reshape(across, (-1, n)) @ to_pose + plant.deflection,
+        actuator=jnp.stack([plant.voltage, wrench @ left_out.actuator_wrench]),
+        slider_force=jnp.stack([plant.force, 0.0 * plant.force]),
+        hammer=jnp.stack([hammer, wrench @ left_out.hammer_wrench]),
+        sensor=plant.sensor + moved[: len(to_sensor)],
+        deflection=deflection,
+        across=jnp.reshape(across, (-1, n)) @ to_pose + deflection,
         along=jnp.reshape(along, (-1, n)) @ to_pose,
         slider=jnp.pad(jax.jacfwd(rho)(pose), others),
         pose=to_pose,
-        actuator_to_sensor=plant.direct_sensor,
-        actuator_to_deflection=plant.direct_deflection,
+        from_actuator=jnp.concatenate([to_sensor, to_deflection]) + by_motion @ plant.voltage,
+        from_slider_force=by_motion @ plant.force,
+        from_hammer=left_out.by_force + by_motion @ hammer,
         drive=jnp.stack([gains.position, gains.rate]),
+    )
+
+
+class _LeftOut(NamedTuple):
+    """What modes that are left out do; zero where the model is truncated."""
+
+    by_force: Array  # to sensors, then deflections, by forces at the stations, (3 (K + S), 3 S)
+    by_motion: Array  # the same by accelerations of the pose, (3 (K + S), 3)
+    hammer_wrench: Array  # on the pose per second derivative of such forces, (3, 3 S)
+    actuator_wrench: Array  # of the actuators' voltages, (3, 3 K)
+
+
+def _left_out(structure: Structure, case: Case, prepared: Prepared, pose: Array) -> _LeftOut:
+    loop, stations, k = prepared.loop, station_places(case), structure.n_patches
+    beam, patches, still = case.machine.beam, case.machine.patches, jnp.zeros_like(pose)
+    loads = left_out_of_loads(structure.basis, beam, patches, stations, prepared.bases.plant)
+    constants = sensor_constant(beam, patches), 1.0, actuator_constant(beam, patches)
+    one = jnp.full((structure.n_links, 1), float(loop.left_out is not None))
+    ends = one * jnp.array([0.0, 1.0])
+    # the motion across a link at its joint, and its change along the link, (3, 2, 3)
+    across = jax.jacfwd(lambda rate: _point_rates(loop, ends, pose, rate)[0])(still)
+    motion = -jnp.stack([across[:, 0], across[:, 1] - across[:, 0]], axis=1)
+    volts, bent, driven = (
+        one[..., None] * jnp.reshape(constant * jnp.ones(structure.n_links), (-1, 1, 1)) * part
+        for constant, part in zip(
+            constants, jnp.split(loads, (k, loads.shape[1] - k), 1), strict=True
+        )
+    )
+
+    def beside(x: Array) -> Array:
+        return jnp.reshape(x[..., -2:] @ motion, (-1, len(pose)))
+
+    return _LeftOut(
+        jnp.concatenate([jax.scipy.linalg.block_diag(*x[..., :-2]) for x in (volts, bent)]),
+        jnp.concatenate([beside(volts), beside(bent)]),
+        beside(bent).T,
+        beside(driven).T,
     )
 
 
@@ -92,8 +143,8 @@ def _point_rates(loop: Loop, stations: Array, pose: Array, rate: Array) -> tuple
     return across, jnp.broadcast_to((chain.cosine * chain.rho_rate)[:, None], across.shape)
 
 
-def _hammer(structure: Structure, loop: Loop, case: Case, pose: Array) -> Array:
-    """Columns of B of unit forces across the links, (n, 3 S).
+def _forces(structure: Structure, loop: Loop, case: Case, pose: Array) -> tuple[Array, Array]:
+    """Columns of B of unit forces across the links, (n, 3 S), and on the pose, (n, 3).
 
     A force at x does work on v_n = x gamma' - sin(gamma) rho' + sum Y_j(x) q_j': it is a wrench on
     the platform, and a force on each mode.
@@ -109,8 +160,8 @@ def _hammer(structure: Structure, loop: Loop, case: Case, pose: Array) -> Array:
     reference = Reference(chain.rho, chain.rho_rate, still, still)
     open_loop = structure._replace(feedback="none")
 
-    def derivative(force: Array) -> Array:
-        wrench = jnp.einsum("is,isp->p", force, to_pose)
+    def derivative(force: Array, wrench: Array) -> Array:
+        wrench = wrench + jnp.einsum("is,isp->p", force, to_pose)
         if structure.has_wrench:
             wrench = wrench + case.load.wrench
         at = PlantState(pose, still, zero, zero)
@@ -118,7 +169,8 @@ def _hammer(structure: Structure, loop: Loop, case: Case, pose: Array) -> Array:
         return flatten(PlantState(still, rates.acceleration.pose, zero, rates.acceleration.modal))
 
     forces = jnp.zeros((structure.n_links, count), pose.dtype)
-    return jnp.reshape(jax.jacfwd(derivative)(forces), (-1, forces.size))
+    by_force, by_wrench = jax.jacfwd(derivative, (0, 1))(forces, still)
+    return jnp.reshape(by_force, (-1, forces.size)), by_wrench
 
 
 def held_modes(structure: Structure, case: Case) -> tuple[Array, Array]:

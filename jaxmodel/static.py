@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array, Beam, Patches
 from jaxmodel.piezo import bare_stiffness, one_sided_section, patch_ends, two_sided_section
@@ -30,17 +32,18 @@ class Pieces(NamedTuple):
     has_ceramic: Array  # 1 where a sensor that is a patch covers it, else 0, (K, n)
 
 
-def link_pieces(beam: Beam, patches: Patches) -> Pieces:
+def link_pieces(beam: Beam, patches: Patches, places: Array = ()) -> Pieces:
     """Cut one link at the ends of its patches, in any order and overlap.
 
     Args:
         beam: one link's data, () fields.
         patches: its patches, () fields and centres (K,) [m].
+        places: where else to cut [m], (S,).
     """
     length = jnp.asarray(beam.length)
     sensor = patch_ends(patches.center, patches.sensor_length)
     actuator = patch_ends(patches.center, patches.actuator_length)
-    cuts = jnp.sort(jnp.concatenate([*sensor, *actuator]))
+    cuts = jnp.sort(jnp.concatenate([*sensor, *actuator, jnp.asarray(places)]))
     cuts = jnp.concatenate([jnp.zeros((1,)), jnp.clip(cuts, 0.0, length), length[None]])
     middle = (cuts[1:] + cuts[:-1]) / 2
 
@@ -109,6 +112,59 @@ def static_bending(
     slope = jnp.einsum("kn,ln,n->kl", pieces.has_sensor, pieces.has_actuator, width)
     bent = bent_at(pieces, beam.length, stations) * softness
     return StaticResponse(slope, jnp.einsum("sn,ln->sl", bent, pieces.has_actuator))
+
+
+def static_loads(beam: Beam, patches: Patches, stations: Array, has_patches: bool) -> Array:
+    """Static response of one link to forces across it and to the inertia of its own motion.
+
+    With M = E I w'' under a load and M_x under a unit force at x, w(x) = int M M_x/(E I) dx, and
+    the slopes at the ends of a sensor differ by int M/(E I) over it. M_x = <s - x> - s (1 - x/L);
+    under a load f the first term is int f <s - x> dx, and M vanishes at both ends. All are
+    polynomials between the cuts, integrated exactly.
+
+    Args:
+        beam, patches: one link's data.
+        stations: where forces act and deflections are taken [m], (S,).
+        has_patches: patches stiffen and load the link, and its joints have inertia (static).
+
+    Returns:
+        (2 K + S, S + 2): slopes over the sensors [rad], deflections at the stations [m] and slopes
+        over the actuators [rad], by unit forces at the stations [1/N], the load rhoA [per m/s2]
+        and the load rhoA x [per rad/s2].
+    """
+    length, pieces = beam.length, link_pieces(beam, patches, stations)
+    left, width = pieces.left[:, None], (pieces.right - pieces.left)[:, None]
+    node, weight = np.polynomial.legendre.leggauss(3)
+    s = left + width * (node + 1) / 2  # (n, 3)
+    stiffness = section_stiffness(beam, patches, pieces, has_patches)
+    softness = width * weight / 2 / stiffness[:, None]
+    line_mass = beam.density * beam.width * beam.thickness * jnp.ones_like(pieces.left)
+    if has_patches:
+        ceramic = patches.density * patches.width * patches.thickness
+        line_mass += ceramic * jnp.sum(pieces.has_ceramic + pieces.has_actuator, axis=0)
+
+    def heaped(s: Array) -> Array:
+        """int rhoA <s - x> dx and int rhoA x <s - x> dx, (2, len(s))."""
+
+        def beyond(p: Array) -> Array:
+            reach = jnp.maximum(s[:, None] - p, 0.0)
+            return jnp.stack([reach**2 / 2, p * reach**2 / 2 + reach**3 / 6])
+
+        return (beyond(pieces.left) - beyond(pieces.right)) @ line_mass
+
+    at = jnp.asarray(stations)[:, None, None]
+    pushed = jnp.maximum(s - at, 0.0) - s * (1 - at / length)
+    inertia = jnp.reshape(heaped(s.ravel()), (2, *s.shape))
+    inertia -= s / length * heaped(jnp.reshape(length, (1,)))[:, :, None]
+    if has_patches:
+        ends = beam.joint_inertia_c * s / length - beam.joint_inertia_b * (1 - s / length)
+        inertia = inertia.at[1].add(ends)
+    moment = jnp.concatenate([pushed, inertia])
+    seen, driven = (
+        x[:, :, None] * jnp.ones_like(s) for x in (pieces.has_sensor, pieces.has_actuator)
+    )
+    rows = jnp.concatenate([seen, pushed, driven])
+    return jnp.einsum("vng,lng,ng->vl", rows, moment, softness)
 
 
 def static_remainder(basis: ModalBasis, mode_mask: Array = 1.0) -> StaticResponse:

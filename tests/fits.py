@@ -215,7 +215,7 @@ def write_decays(folder, bench, values):
     course = np.exp(np.outer(np.arange(5000) / rate, pole))
     parts = []
     for link in range(3):
-        start = left @ plant.value.actuator[:, link * bench.n_patches]
+        start = left @ plant.value.actuator[0, :, link * bench.n_patches]
         parts.append(((course * start) @ right.T @ rows.T).real)
     signals = np.concatenate(parts) / np.std(parts)
     signals += 0.002 * rng.normal(size=signals.shape)

@@ -102,22 +102,25 @@ class PlantAt:
         return self._at({"platform": "pose", "motor": "slider"}.get(signal.kind, signal.kind), rows)
 
     def input(self, signal: Signal, column: int) -> Row:
-        """Column of B, (n,), and its derivatives, (n, p); a command is a force on its slider."""
-        name = signal.kind if signal.kind in ("actuator", "hammer") else "slider_force"
-        return self._at(name, (slice(None), column))
+        """Columns of B_0 and B_2, (2, n), and derivatives; a command is a force on its slider."""
+        return self._at(_input_of(signal), (slice(None), slice(None), column))
 
     def direct(self, source: Signal, output: Signal, column: int, row: int) -> Row:
         """Entry of D, (), and its derivatives, (p,)."""
-        if source.kind == "actuator" and output.kind in ("sensor", "deflection"):
-            return self._at(f"actuator_to_{output.kind}", (row, column))
-        if source.kind == "actuator" and output.kind == "accelerometer":
-            across = np.sin(np.deg2rad(output.angle))
-            return _sum_of((across, self._at("actuator_to_deflection", (row, column))))
-        return np.zeros(()), None if self.slope is None else np.zeros(())
+        factor = np.sin(np.deg2rad(output.angle)) if output.kind == "accelerometer" else 1.0
+        if output.kind in ("accelerometer", "deflection"):
+            row += len(self.value.sensor)
+        elif output.kind != "sensor":
+            return np.zeros(()), None if self.slope is None else np.zeros(())
+        return _sum_of((factor, self._at(f"from_{_input_of(source)}", (row, column))))
 
     def _at(self, name: str, index: Any) -> Row:
         value = getattr(self.value, name)[index]
         return value, None if self.slope is None else getattr(self.slope, name)[index]
+
+
+def _input_of(signal: Signal) -> str:
+    return signal.kind if signal.kind in ("actuator", "hammer") else "slider_force"
 
 
 def _sum_of(*parts: tuple[float, Row]) -> Row:
@@ -371,7 +374,7 @@ def _times(one: FrequencyResponse, other: FrequencyResponse, sign: float) -> Fre
 def _of_plant(
     plant: PlantAt, signals: tuple[Signal, Signal], at: tuple[int, int], omega: np.ndarray
 ) -> FrequencyResponse:
-    """C (j omega - A)^-1 B + D of one input and one output.
+    """C (j omega - A)^-1 B + D of one input and one output, B = B_0 - omega^2 B_2.
 
     Its differential is dC X + Y dA X + Y dB + dD with X = (j omega - A)^-1 B and
     Y = C (j omega - A)^-1.
@@ -382,21 +385,23 @@ def _of_plant(
         at: their places among signals of their kinds.
         omega: [rad/s], (f,).
     """
-    source, output = plant.input(signals[0], at[0]), plant.output(signals[1], at[1])
+    (source, by_source), output = plant.input(signals[0], at[0]), plant.output(signals[1], at[1])
+    powers = np.stack([np.ones_like(omega), -(omega**2)], axis=1)
     direct = plant.direct(*signals, *at)
     pole, right, left = plant.eigen
     if left is None:  # without eigenvectors
         whole = 1j * omega[:, None, None] * np.eye(len(pole)) - plant.value.state
-        x = _solve(whole, source[0])
-        y = _solve(np.swapaxes(whole, 1, 2), output[0])
+        x = _solve(whole, powers @ source)
+        y = _solve(np.swapaxes(whole, 1, 2), output[0][None])
     else:
         resolvent = 1 / (1j * omega[:, None] - pole)
-        x = (resolvent * (left @ source[0])) @ right.T
+        x = (resolvent * (powers @ source @ left.T)) @ right.T
         y = (resolvent * (output[0] @ right)) @ left
     gain = x @ output[0] + direct[0]
-    if plant.slope is None or source[1] is None or output[1] is None or direct[1] is None:
+    if plant.slope is None or by_source is None or output[1] is None or direct[1] is None:
         return FrequencyResponse(gain, None)
-    slope = _both_sides(y, plant.slope.state, x) + x @ output[1] + y @ source[1] + direct[1]
+    slope = _both_sides(y, plant.slope.state, x) + x @ output[1] + direct[1]
+    slope += np.einsum("fk,fn,knp->fp", powers, y, by_source, optimize=True)
     return FrequencyResponse(gain, slope)
 
 
@@ -418,6 +423,6 @@ def _both_sides(left: np.ndarray, change: np.ndarray, right: np.ndarray) -> np.n
 
 
 def _solve(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solutions for one right-hand side, (f, n)."""
-    many = np.broadcast_to(right[:, None], (*matrices.shape[:2], 1))
+    """Solutions for right-hand sides, (f, n) or (1, n)."""
+    many = np.broadcast_to(right[..., None], (*matrices.shape[:2], 1))
     return np.linalg.solve(matrices, many)[..., 0]
