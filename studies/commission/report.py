@@ -26,6 +26,7 @@ class CommissionFindings(NamedTuple):
     fit: dict[str, Any] | None = None
     tuned: Study | None = None
     is_fast: bool = False  # whether it was tuned on a faster motion than its own
+    price: str = ""  # of gains that were lowered after the tuning
     margins: np.ndarray | None = None  # on machines that the data leave possible [1], (n,)
     certificate: dict[str, Any] | None = None
 
@@ -55,7 +56,8 @@ def chosen_text(outcome: CommissionFindings) -> str:
     if outcome.tuned is None:
         return "Chosen: no controller yet."
     control, rate = outcome.tuned.control, outcome.tuned.electronics.sample_rate_hz
-    gain = f"gain factor {control.gain_factor:.4g}, {rate:g} Hz"
+    price = f" ({outcome.price})" if outcome.price else ""
+    gain = f"gain factor {control.gain_factor:.4g}{price}, {rate:g} Hz"
     if outcome.is_fast:
         gain += (
             f", tuned on a fast first move without shaper, because the motion of the file leaves "
@@ -77,7 +79,7 @@ def sure_text(outcome: CommissionFindings) -> str:
         )
     if outcome.certificate is not None:
         verdict = outcome.certificate["verdict"]
-        parts.append(f"certificate, on plants further off than those, {verdict}")
+        parts.append(f"certificate, on plants of the same basis further off, {verdict}")
     if outcome.done == "firmware" and not outcome.refusals:
         parts.append("the exported code agrees with the design")
     return f"How sure: {'; '.join(parts) or 'not judged'}."

@@ -27,6 +27,7 @@ from studies.commission.stages import (
     is_verified,
     keep_answer,
     possible_machines,
+    price_text,
     tuned_design,
 )
 from studies.engine.folder import (
@@ -150,7 +151,8 @@ def _judge_tuned(
     margins = _margins(outcome.out, console)
     tuned = tuned_design(outcome.out).study
     is_fast = has_fast_motion(outcome.out, tuned)
-    outcome = outcome._replace(tuned=tuned, is_fast=is_fast, margins=margins)
+    price = price_text(outcome.out, tuned)
+    outcome = outcome._replace(tuned=tuned, is_fast=is_fast, margins=margins, price=price)
     low = int(np.sum(margins < wanted))
     text = (
         f"on {low} of {len(margins)} machines that the data leave possible the gain margin "

@@ -47,7 +47,7 @@ class Commission(Section):
     )
     dac_bits: int = described(DAC_BITS, "1", "resolution of the DAC, for c-fixed", ge=4, le=16)
     gain_margin: float = described(
-        2.0, "1", "least gain margin on every machine that the data leave possible", ge=1, le=16
+        2.0, "1", "least gain margin on every machine that the data leave possible", gt=1, le=16
     )
 
 

@@ -356,7 +356,10 @@ def load_fit(path: str | Path) -> FitSpec:
     Raises:
         StudyError: unreadable, not TOML, or not a valid fit.
     """
-    return parse_fit(read_toml(path), find_spec(path).parent)
+    data = read_toml(path)
+    # the file of a commissioning has a fit; what follows it is not read here
+    read = {name: value for name, value in data.items() if name not in ("tune", "commission")}
+    return parse_fit(read if "commission" in data else data, find_spec(path).parent)
 
 
 def parse_fit(data: dict[str, Any], folder: str | Path = ".") -> FitSpec:

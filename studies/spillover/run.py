@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from jaxmodel.beam import BASES
 from jaxmodel.changes import MachineChange
 from jaxmodel.laws import LAWS
 from studies.engine.breaking import TOLERANCES, smallest_change
@@ -49,6 +50,7 @@ def spillover_design(
     has_pdf: bool = False,
     has_proofs: bool = False,
     tolerances: MachineChange = TOLERANCES,
+    bases: tuple[str, ...] = tuple(BASES),
 ) -> Certificate:
     """Write the certificate of a design.
 
@@ -61,6 +63,7 @@ def spillover_design(
         has_proofs: also prove stability for every number of modes and for a box of machines, where
             that is possible within a minute or two.
         tolerances: units of the smallest change that breaks it, see `smallest_change`.
+        bases: modal bases of the plants.
 
     Returns:
         the certificate; `is_passed`: whether the design passes on every plant, and proofs found no
@@ -76,7 +79,7 @@ def spillover_design(
     names = (PHASES[0], "prove", *PHASES[1:]) if has_proofs else PHASES
     with Phases(console, names) as phases:
         phases.begin("judge", "the controller on plants that differ from its nominal model")
-        certificate = certify(study, margin)
+        certificate = certify(study, margin, bases)
         if has_proofs:
             phases.begin("prove", "every number of modes, and a box of machines")
             certificate = certificate._replace(proofs=prove(fixed_controller(study)))

@@ -14,15 +14,18 @@ from studies.commission import stages
 from studies.commission.machines import Possible, margin_spread, margins_on, unknown_to_controller
 from studies.commission.report import CommissionFindings, summary
 from studies.commission.run import run_commission
-from studies.commission.spec import LOUDER, RESERVE, parse_measured, tuning_section
+from studies.commission.spec import LOUDER, RESERVE, load_measured, parse_measured, tuning_section
 from studies.commission.stages import STAGES, possible_machines
 from studies.engine.controller import fixed_controller
+from studies.engine.design import Design
 from studies.engine.fast_motion import TellingMotion, make_fast
 from studies.engine.folder import make_manifest
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.export.firmware import build as building
+from studies.fitting.spec import load_fit
 from studies.show.document import schema
+from studies.spillover.certificate import certify
 from studies.tuning.folder import open_tuning
 from studies.tuning.spec import parse_tuning
 from tests.canonical import MACHINE, TINY, study_of
@@ -118,6 +121,48 @@ def test_the_spread_of_margins_is_that_of_possible_machines():
     assert margin_spread(Possible(names, np.array([[-1.0]])), STUDY) == 1  # there is none
 
 
+AS_BUILT = Possible((), np.zeros((1, 0)))
+
+
+def test_a_fit_reads_the_file_of_a_commissioning(tmp_path):
+    written = """[fit.free]
+"link.youngs_modulus" = { from = 60e9, to = 80e9 }
+[[fit.data]]
+kind = "modes"
+frequency_hz = [114.0, 114.0, 114.0]
+sigma_hz = 0.5
+[tune]
+starts = 4
+"""
+    (tmp_path / "tuned.toml").write_text(written)
+    with pytest.raises(StudyError, match="tune"):  # a mistake where there is no commissioning
+        load_fit(tmp_path / "tuned.toml")
+    (tmp_path / "whole.toml").write_text(written + '[commission]\ntarget = "c"\n')
+    assert (
+        load_fit(tmp_path / "whole.toml").entries
+        == load_measured(tmp_path / "whole.toml").fit.entries
+    )
+
+
+def test_gains_are_lowered_until_later_stages_find_their_margins(monkeypatch, tmp_path):
+    measured = parse_measured(data())
+    study = STUDY.change(control__gain_factor=2.0)
+    lowered = stages._lowered(study, AS_BUILT, measured)
+    certificate = certify(lowered, 2.0, (study.link.basis,))
+    assert certificate.is_passed and np.nanmin(certificate.margin) < 2.1
+    monkeypatch.setattr(stages, "load_design", lambda folder: Design(study, {}))
+    price = stages.price_text(tmp_path, lowered)
+    assert re.match(r"lowered from 2, .* is 0\.\d+ instead of 0\.\d+", price)
+    assert stages.price_text(tmp_path, study) == ""
+
+
+def test_plants_that_would_not_have_explained_the_data_lower_nothing():
+    """The bare links that patches do not stiffen have nearly twice the loop gain."""
+    study = STUDY.change(link__basis="loaded", control__basis="loaded", control__gain_factor=1.0)
+    assert stages._lowered(study, AS_BUILT, parse_measured(data())) is study
+    assert not certify(study, 2.0).is_passed
+
+
 # --- stages ---------------------------------------------------------------------------------------
 
 FIT = {
@@ -153,6 +198,7 @@ class Pretended:
         tuned = type("Tuned", (), {"study": STUDY})
         monkeypatch.setattr(commissioning, "tuned_design", lambda out: tuned)
         monkeypatch.setattr(commissioning, "has_fast_motion", lambda out, tuned: True)
+        monkeypatch.setattr(commissioning, "price_text", lambda out, tuned: "lowered from 0.6")
 
     def _certificate(self):
         is_passed = self.answers["is_passed"]
@@ -190,6 +236,7 @@ def test_all_stages_lead_to_firmware(monkeypatch, tmp_path):
     assert made.is_good and pretended.calls == ["fit", "tune", "certificate", "firmware"]
     assert "gain margin 2.5 or more on 2 machines" in text and "link.youngs_modulus 7e+10" in text
     assert "tuned on a fast first move without shaper" in text
+    assert re.search(r"gain factor [\d.]+ \(lowered from 0.6\), ", text)
     assert "commissioned" in page and "firmware/verification.html" in page
 
 
