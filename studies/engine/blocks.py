@@ -1,7 +1,9 @@
-"""A controller without channels in the form code needs: systems of controlled links, in 2x2 blocks.
+"""A controller without channels in the form code needs: systems of controlled links, in blocks.
 
 All arrays have the groups first: the controlled links, each with its own system, or one system for
-all links together.
+all links together. Blocks are pairs of states: a pair of poles, or two real ones. Where that would
+cost digits, as nearly equal poles of a long delay line can, each group is one block of the states
+that its law was designed in, with the delay line as a shift register.
 """
 
 from __future__ import annotations
@@ -10,11 +12,13 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-import scipy
 
 from jaxmodel.controller import Controller
 from jaxmodel.state_space import IllConditionedError, StateSpace, dense, modal_form
-from studies.errors import StudyError
+
+#: What pairs of states may change of a command over the largest, a third of what exports allow [1],
+#: and over how many samples both are compared.
+ALIKE, COMPARED = 3e-13, 2**13
 
 
 class ModalBlocks(NamedTuple):
@@ -23,7 +27,7 @@ class ModalBlocks(NamedTuple):
     n_links: int  # of the machine
     link: np.ndarray  # controlled links, from 0
     first: np.ndarray  # sensor and actuator of each group's first port, from 0, (G,)
-    system: StateSpace  # of these groups, blocks of 2 states
+    system: StateSpace  # of these groups, blocks of b states
 
     @property
     def kind(self) -> str:
@@ -33,9 +37,11 @@ class ModalBlocks(NamedTuple):
     @property
     def names(self) -> list[str]:
         """Readable names of the states."""
-        groups, n = self.system.state.shape[:2]
+        groups, n, size, _ = self.system.state.shape
         places = [f"link {i + 1}, " for i in self.link] if len(self.link) == groups else [""]
-        return [f"{at}block {k + 1}.{r + 1}" for at in places for k in range(n) for r in range(2)]
+        return [
+            f"{at}block {k + 1}.{r + 1}" for at in places for k in range(n) for r in range(size)
+        ]
 
     @property
     def slowest_pole(self) -> float:
@@ -62,11 +68,7 @@ class ModalBlocks(NamedTuple):
 
 
 def modal_blocks(system: StateSpace, n_links: int) -> ModalBlocks:
-    """Modal blocks of a machine's system, NumPy arrays; links without output are left out.
-
-    Raises:
-        StudyError: no well-conditioned modal form.
-    """
+    """Blocks of a machine's system, NumPy arrays; links without output are left out."""
     is_on = np.any(system.leave, axis=(2, 3)) | np.any(system.direct, axis=2)
     is_on = is_on.reshape(n_links, -1)
     used, n_patches = np.flatnonzero(is_on.any(axis=1)), is_on.shape[1]
@@ -74,49 +76,70 @@ def modal_blocks(system: StateSpace, n_links: int) -> ModalBlocks:
         groups, first = [0], np.array([0])
     else:
         groups, first = list(used), used * n_patches
-    return ModalBlocks(n_links, used, first, _stack_groups([_to_pairs(system, g) for g in groups]))
+    own = [jax.tree.map(lambda part, g=g: part[g : g + 1], system) for g in groups]
+    if system.state.shape[2] != 2:
+        own = [_observed(one) for one in own]
+        pairs = [_to_pairs(one) for one in own]
+        # all groups have blocks of one size
+        own = own if None in pairs else pairs
+    return ModalBlocks(n_links, used, first, _stack_groups(own))
 
 
-def _to_pairs(system: StateSpace, group: int) -> StateSpace:
-    """One group, its blocks of two states."""
-    one = jax.tree.map(lambda part: part[group : group + 1], system)
-    if system.state.shape[2] == 2:
-        return one
+def _observed(one: StateSpace) -> StateSpace:
+    """One group as one block, without states that nothing depends on, as older commands."""
+    a, b, c, d = dense(one)
+    tell = None if one.anti_windup is None else one.anti_windup.reshape(b.shape)
+    used = np.any(a, axis=0) | np.any(c, axis=0)
+    kept = StateSpace(
+        state=a[None, None][..., used, :][..., used],
+        enter=b[None, None, used],
+        leave=c[None, :, None, used],
+        direct=d[None],
+        anti_windup=None if tell is None else tell[None, None, used],
+    )
+    return kept if used.all() else _observed(kept)
+
+
+def _to_pairs(one: StateSpace) -> StateSpace | None:
+    """One group, its blocks of two states; None: that would cost digits."""
     a, b, c, d = dense(one)
     size, tell = len(d), one.anti_windup
     if tell is not None:
         b = np.hstack([b, tell.reshape(len(a), size)])
     try:
-        form = modal_form(a, b, c)
-    except IllConditionedError as error:
-        raise StudyError(f"the controller has {error}") from None
-    enter = form.enter[None, ..., :size]
-    tell = None if tell is None else form.enter[None, ..., size:]
-    return StateSpace(
+        form = modal_form(a, b, c, worst=1 / np.finfo(float).eps)
+    except IllConditionedError:
+        return None
+    pairs = StateSpace(
         state=form.state[None],
-        enter=enter,
+        enter=form.enter[None, ..., :size],
         leave=form.leave[None],
         direct=d[None],
-        anti_windup=tell,
+        anti_windup=None if tell is None else form.enter[None, ..., size:],
     )
+    return pairs if _largest_change(one, pairs) <= ALIKE else None
+
+
+def _largest_change(one: StateSpace, pairs: StateSpace) -> float:
+    """What differs of a command, over the largest that sensors or limits can make it."""
+    ways = [(one, pairs)]
+    if one.anti_windup is not None:
+        ways.append((one._replace(enter=one.anti_windup), pairs._replace(enter=pairs.anti_windup)))
+    found = [[responses(x, 0, COMPARED).command for x in way] for way in ways]
+    away = [np.abs(x - y).sum(axis=(1, 2)).max() for x, y in found]
+    # limits change a demand by less than its size
+    return float(np.max([away[0] / np.abs(found[0][0]).sum(axis=(1, 2)).max(), *away[1:]]))
 
 
 def _stack_groups(parts: list[StateSpace]) -> StateSpace:
-    """Groups side by side, padded with blocks that stay 0."""
-    most = max((part.state.shape[1] for part in parts), default=0)
-    tell = [part.anti_windup for part in parts if part.anti_windup is not None]
+    """Groups side by side, padded with states that stay 0."""
 
-    def padded(x: np.ndarray, axis: int) -> np.ndarray:
-        more = most - x.shape[axis]
-        return np.pad(x, [(0, more if k == axis else 0) for k in range(x.ndim)])
+    def stacked(*each: np.ndarray) -> np.ndarray:
+        most = np.max([x.shape for x in each], axis=0)
+        return np.concatenate([np.pad(x, [(0, n) for n in most - x.shape]) for x in each])
 
-    return StateSpace(
-        state=np.concatenate([padded(x.state, 1) for x in parts]),
-        enter=np.concatenate([padded(x.enter, 1) for x in parts]),
-        leave=np.concatenate([padded(x.leave, 2) for x in parts]),
-        direct=np.concatenate([x.direct for x in parts]),
-        anti_windup=np.concatenate([padded(x, 1) for x in tell]) if tell else None,
-    )
+    whole: StateSpace = jax.tree.map(stacked, *parts)
+    return whole
 
 
 def unfold_blocks(blocks: ModalBlocks, like: Controller) -> Controller:
@@ -136,40 +159,40 @@ def unfold_blocks(blocks: ModalBlocks, like: Controller) -> Controller:
 class ImpulseResponses(NamedTuple):
     """Impulse responses of one group over n samples."""
 
-    state: np.ndarray  # of each state, per sensor, (N, 2, M, n)
+    state: np.ndarray  # of each state, per sensor, (N, b, M, n)
     command: np.ndarray  # of each actuator, per sensor, (M, M, n)
-    kicked: np.ndarray  # of each actuator, to what is added to a state, (M, N, 2, n)
+    kicked: np.ndarray  # of each actuator, to what is added to a state, (M, N, b, n)
 
 
 def responses(system: StateSpace, group: int, n: int) -> ImpulseResponses:
-    """Impulse responses by second-order filters, block by block.
+    """Impulse responses, block by block.
 
     Args:
-        system: blocks of two states.
+        system: in blocks.
         group: which group.
         n: samples.
     """
     state, enter, leave, direct = (part[group] for part in system[:4])
-    count, size = len(state), len(direct)
-    impulse = np.zeros(n)
-    impulse[0] = 1.0
-    response = ImpulseResponses(
-        state=np.zeros((count, 2, size, n)),
-        command=np.zeros((size, size, n)),
-        kicked=np.zeros((size, count, 2, n)),
+    leave = np.moveaxis(leave, 0, -1)  # (N, b, M)
+    moved = _powers(state, enter, n - 1)
+    command = np.einsum("kbp,nkbm->pmn", leave, moved)
+    kicked = _powers(np.swapaxes(state, 1, 2), leave, n - 1)
+    return ImpulseResponses(
+        state=_later(np.moveaxis(moved, 0, -1)),
+        command=np.concatenate([direct[..., None], command], axis=-1),
+        kicked=_later(np.moveaxis(kicked, (0, 3), (-1, 0))),
     )
-    response.command[:, :, 0] = direct
-    for k, a in enumerate(state):
-        below = [1.0, -np.trace(a), np.linalg.det(a)]
-        # (z - A)^-1 = (z + A - tr A)/(z^2 - z tr A + det A), in powers of 1/z
-        last = a + below[1] * np.eye(2)
-        moved = np.array(
-            [
-                [scipy.signal.lfilter([0.0, i == r, last[i, r]], below, impulse) for r in (0, 1)]
-                for i in (0, 1)
-            ]
-        )
-        response.state[k] = np.einsum("irn,rm->imn", moved, enter[k])
-        response.command[:] += np.einsum("pi,imn->pmn", leave[:, k], response.state[k])
-        response.kicked[:, k] = np.einsum("pi,irn->prn", leave[:, k], moved)
-    return response
+
+
+def _later(x: np.ndarray) -> np.ndarray:
+    """A sample later, along the last axis."""
+    return np.concatenate([np.zeros_like(x[..., :1]), x], axis=-1)
+
+
+def _powers(matrix: np.ndarray, start: np.ndarray, n: int) -> np.ndarray:
+    """M^k S for k = 0 to n - 1 by doubling, (n, ...)."""
+    rows = start[None]
+    while len(rows) < n:
+        rows = np.concatenate([rows, matrix @ rows])
+        matrix = matrix @ matrix
+    return rows[:n]

@@ -106,11 +106,7 @@ def _check_exportable(study: Study) -> None:
 
 
 def arrange(controller: Controller, law: str) -> ActiveChannels | ModalBlocks:
-    """A controller as code needs it.
-
-    Raises:
-        StudyError: a system without a well-conditioned modal form.
-    """
+    """A controller as code needs it."""
     if isinstance(controller.feedback, StateSpace):
         return modal_blocks(controller.feedback, len(controller.feedthrough))
     return fold(controller.feedback, LAWS[law].channel)

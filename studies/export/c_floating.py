@@ -48,7 +48,7 @@ def _constants(channels: ActiveChannels | ModalBlocks) -> dict[str, Any]:
     size = system.direct.shape[1]
     return {
         "has_rivals": False,
-        "state_rows": system.state.reshape(-1, 2),
+        "state_rows": system.state.reshape(-1, system.state.shape[3]),
         "enter_rows": system.enter.reshape(-1, size),
         "leave_rows": system.leave.reshape(len(system.leave) * size, -1),
         "direct_rows": system.direct.reshape(-1, size),

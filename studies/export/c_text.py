@@ -84,13 +84,14 @@ def _channel_values(channels: ActiveChannels | ModalBlocks) -> dict[str, Any]:
             "has_anti_windup": False,
             "is_rival": channels.is_rival.astype(int),
         }
-    groups, n, _, size = channels.system.enter.shape
+    groups, n, block, size = channels.system.enter.shape
     ports = [f"system {g + 1}, actuator {k + 1}" for g in range(groups) for k in range(size)]
     return {
         "blocks": channels,
         "channels": None,
         "has_anti_windup": channels.system.anti_windup is not None,
-        "order": 2 * n,
+        "order": n * block,
+        "block": block,
         "n_ports": size,
         "port_names": ports,
     }

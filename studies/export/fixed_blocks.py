@@ -42,11 +42,11 @@ class FixedBlocks(NamedTuple):
 
     wires: Wires
     blocks: ModalBlocks  # the same in SI units
-    state: Format  # [V], (G, N, 2)
-    advance: IntegerRow  # two states of the block, then the sensors, (G, N, 2, 2 + M)
-    leave: IntegerRow  # all states of the group, then the sensors, (G, M, 2 N + M)
+    state: Format  # [V], (G, N, b)
+    advance: IntegerRow  # states of the block, then the sensors, (G, N, b, b + M)
+    leave: IntegerRow  # all states of the group, then the sensors, (G, M, b N + M)
     error: ErrorBound
-    # states from what the limits change, in DAC codes, (G, N, 2, M); None: they are not told
+    # states from what the limits change, in DAC codes, (G, N, b, M); None: they are not told
     anti_windup: IntegerRow | None = None
 
     @property
@@ -75,7 +75,7 @@ def design_blocks(
     check_words(exported)
     wires = design_wires(exported, dac_bits, word)
     system, memory = blocks.system, blocks.memory(FORGOTTEN)
-    groups, n, _, size = system.enter.shape
+    groups, _, _, size = system.enter.shape
     volts = blocks.of_groups(sensor_bound(exported.controller))  # (G, M)
     each = [responses(system, g, memory) for g in range(groups)]
     if system.anti_windup is None:
@@ -88,7 +88,7 @@ def design_blocks(
     step, sensor = state.step, wires.sensor_step
     within = system.state * step[:, :, None, :] / step[..., None]
     entering = system.enter * sensor / step[..., None]
-    leaving = (system.leave * step[:, None] / wires.dac_step).reshape(groups, size, 2 * n)
+    leaving = (system.leave * step[:, None] / wires.dac_step).reshape(groups, size, -1)
     direct = system.direct * sensor / wires.dac_step
     fixed = FixedBlocks(
         wires=wires,
@@ -107,15 +107,16 @@ def design_blocks(
 def rounded_blocks(fixed: FixedBlocks, like: ModalBlocks) -> ModalBlocks:
     """The blocks that the integers represent, in SI units."""
     step, wires = fixed.state.step, fixed.wires
-    groups, n = step.shape[:2]
+    order = step[0].size
     advance, leave = fixed.advance.values, fixed.leave.values
-    size = leave.shape[1]
     return like._replace(
         system=StateSpace(
-            state=advance[..., :2] * step[..., None] / step[:, :, None, :],
-            enter=advance[..., 2:] * step[..., None] / wires.sensor_step,
-            leave=leave[..., : 2 * n].reshape(groups, size, n, 2) * wires.dac_step / step[:, None],
-            direct=leave[..., 2 * n :] * wires.dac_step / wires.sensor_step,
+            state=advance[..., : step.shape[2]] * step[..., None] / step[:, :, None, :],
+            enter=advance[..., step.shape[2] :] * step[..., None] / wires.sensor_step,
+            leave=leave[..., :order].reshape(like.system.leave.shape)
+            * wires.dac_step
+            / step[:, None],
+            direct=leave[..., order:] * wires.dac_step / wires.sensor_step,
             anti_windup=None
             if fixed.anti_windup is None
             else fixed.anti_windup.values * step[..., None] / wires.dac_step,
@@ -149,7 +150,7 @@ def design_integers(
 def _bound_observer(
     blocks: ModalBlocks, group: int, sensor: np.ndarray, limit: float
 ) -> np.ndarray:
-    """Largest states that any sensor voltages and limited commands can produce, (N, 2).
+    """Largest states that any sensor voltages and limited commands can produce, (N, b).
 
     With v = u + (v - u): x_(k+1) = (A - E C) x_k + (B - E D) y_k + E v_k, in which |v| is at most
     the limit, so that the sums of impulse responses bound every sequence.
@@ -191,7 +192,7 @@ def _error_bound(
         own = responses(near.system, g, memory)
         # bias and feed-through are rounded once each
         entering = fixed.wires.sensor_step * np.abs(true.command).sum(axis=(1, 2))
-        states = np.abs(own.kicked).sum(axis=3)  # (M, N, 2)
+        states = np.abs(own.kicked).sum(axis=3)  # (M, N, b)
         rounding.append(entering + half * np.sum(states * fixed.state.step[g], axis=(1, 2)))
         coefficients.append(np.abs(own.command - true.command).sum(axis=2) @ volts[g])
     parts = [exact.of_patches(np.array(x), exported.n_patches) for x in (rounding, coefficients)]

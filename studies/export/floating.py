@@ -14,7 +14,7 @@ from studies.engine.channels import ActiveChannels, acting
 class BlockSignals(NamedTuple):
     """Signals of a controller in blocks over time; leading axes (T, ...)."""
 
-    state: np.ndarray  # [V], (..., G, N, 2)
+    state: np.ndarray  # [V], (..., G, N, b)
     demand: np.ndarray  # without limit [V], (..., G, M)
     command: np.ndarray  # [V], (..., 3, K)
 

@@ -14,14 +14,7 @@ from studies.reading import read_bytes
 
 #: Function types that each kind of entry takes; all take 0, unknown.
 _TAKEN = {"response": (4, 5), "spectrum": (2, 9, 10), "trace": (1,), "record": (1,), "decay": (1,)}
-_TYPES = {
-    1: "time response",
-    2: "auto spectrum",
-    3: "cross spectrum",
-    4: "frequency response",
-    6: "coherence",
-    9: "power spectral density",
-}
+_TYPES = {1: "time response", 2: "auto spectrum", 4: "frequency response", 6: "coherence"}
 #: Specific data types that have one unit: name, and SI unit.
 _QUANTITIES = {
     8: ("displacement", "m"),

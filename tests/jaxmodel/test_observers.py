@@ -13,6 +13,8 @@ from jaxmodel.laws.observer import corrections
 from jaxmodel.riccati import filter_gain, regulator_gain, solve_riccati
 from jaxmodel.simulate import simulate
 from jaxmodel.state_space import StateSpace, dense
+from studies.engine.blocks import modal_blocks, responses
+from studies.engine.controller import fixed_controller
 from studies.engine.executor import Executor
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.stability import loop_report, with_margin_modes
@@ -22,6 +24,7 @@ from studies.study.cases import as_arrays, build_case
 from studies.study.spec import parse_study
 from tests.canonical import MACHINE
 from tests.jaxmodel.kept import arrays, design_of, loop_at
+from tests.jaxmodel.test_state_space import assert_code_is_the_controller
 
 SHORT = MACHINE | {"control": {"law": "lqg", "modes": 2}}
 
@@ -363,3 +366,39 @@ def test_slow_forces_walk_as_far_as_new_ones_at_the_corner():
     force = np.array([1.0, 2.0, 3.0])
     corner, period = 2 * np.pi * case.control.parameters["bending_hz"], case.electronics.period
     np.testing.assert_allclose(walk(case, force) / (corner * period), force, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "law, electronics, is_dense",
+    [
+        ("lqg", {"unmodelled_delay": 0.3}, False),
+        ("lqg", {"delay": 1.3}, False),
+        ("lqg", {"unmodelled_delay": 0.3, "sample_rate_hz": 50_000}, False),
+        # two modes leave three patches a direction in which a delay line is a Jordan block
+        ("lqg", {"delay": 2.5}, True),
+        ("observer", {"delay": 1.3}, True),
+        ("observer", {"delay": 2.5}, True),
+    ],
+)
+def test_code_is_the_controller_at_every_delay(law, electronics, is_dense):
+    study = parse_study(SHORT | {"control": {"law": law, "modes": 2}, "electronics": electronics})
+    assert_code_is_the_controller(study)
+    size = fixed_controller(study).channels.system.state.shape[2]
+    if np.finfo(np.longdouble).eps < 1e-18:  # else poles are less accurate, so that more are dense
+        assert (size > 2) == is_dense
+
+
+def test_a_jordan_block_keeps_its_states():
+    """A delay line of three samples beside a mode; commands older than that are left out."""
+    a = np.diag([1.0, 1.0, 1.0, 0.0], -1)
+    a[2, 3:] = a[0, :] = 0.0
+    a[0, 4], a[4, 4], a[3, 2] = 0.5, 0.9, 1.0
+    enter, leave = np.zeros((5, 2)), np.zeros((2, 5))
+    enter[4], leave[0, 2], leave[1, 4] = (1.0, 2.0), 3.0, 1.0
+    system = StateSpace(a[None, None], enter[None, None], leave[None, :, None], np.zeros((1, 2, 2)))
+    found = modal_blocks(system, 1).system
+    kept = [0, 1, 2, 4]
+    np.testing.assert_array_equal(found.state, a[None, None][..., kept, :][..., kept])
+    wanted = [leave @ np.linalg.matrix_power(a, k) @ enter for k in range(20)]
+    response = responses(found, 0, 21).command[..., 1:]
+    np.testing.assert_allclose(np.moveaxis(response, -1, 0), wanted, rtol=1e-14)

@@ -47,7 +47,7 @@ static const {{ wide }} BIAS = {{ fixed.wires.bias }};
 static const int32_t DAC_REST = {{ fixed.wires.dac_rest }};
 
 {% if blocks %}
-/* [state/state] two of the pair, then [state/sensor] of the system's sensors; control.law */
+/* [state/state] those of the block, then [state/sensor] of the system's sensors; control.law */
 static const {{ count }} ADVANCE{{ array(advance, blocks.names) }};
 
 /* [bit] of each row */
@@ -256,16 +256,19 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
             change[k] = limited(within(wanted[FIRST[s] + k]) - wanted[FIRST[s] + k]);
             {% endif %}
         }
-        for (m = 0; m < ORDER; m += 2) {
-            {{ count }} next[2];
+        for (m = 0; m < ORDER; m += BLOCK) {
+            {{ count }} next[BLOCK];
 
-            for (k = 0; k < 2; k++) {
+            for (k = 0; k < BLOCK; k++) {
                 const int row = s * ORDER + m + k;
-                int port;
+                int from, port;
 
-                sum = ({{ wide }})ADVANCE[row][0] * x[m] + ({{ wide }})ADVANCE[row][1] * x[m + 1];
+                sum = 0;
+                for (from = 0; from < BLOCK; from++) {
+                    sum += ({{ wide }})ADVANCE[row][from] * x[m + from];
+                }
                 for (port = 0; port < N_PORTS; port++) {
-                    sum += ({{ wide }})ADVANCE[row][2 + port] * in[port];
+                    sum += ({{ wide }})ADVANCE[row][BLOCK + port] * in[port];
                 }
                 {% if has_anti_windup %}
                 sum = shifted(sum, ADVANCE_SHIFT[row]);
@@ -281,8 +284,9 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
                 next[k] = limited(shifted(sum, ADVANCE_SHIFT[row]));
                 {% endif %}
             }
-            x[m] = next[0];
-            x[m + 1] = next[1];
+            for (k = 0; k < BLOCK; k++) {
+                x[m + k] = next[k];
+            }
         }
     }
     {% else %}

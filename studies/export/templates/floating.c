@@ -34,7 +34,7 @@ static const real CONDITIONER_GAIN = {{ real(controller.adc_gain) }};
 static const real LIMIT = {{ real(controller.voltage_limit) }};
 
 {% if blocks %}
-/* [1] of the pair's two states, row by row; control.law */
+/* [1] of the block's states, row by row; control.law */
 static const real STATE{{ array(state_rows, blocks.names) }};
 
 /* [1] of the system's sensors, per volt */
@@ -197,14 +197,17 @@ int {{ name }}_step({{ name }}_state *state, const real sensor[{{ NAME }}_N_CHAN
             change[k] = within(sum) - sum;
             {% endif %}
         }
-        for (m = 0; m < ORDER; m += 2) {
-            real next[2];
+        for (m = 0; m < ORDER; m += BLOCK) {
+            real next[BLOCK];
 
-            for (k = 0; k < 2; k++) {
+            for (k = 0; k < BLOCK; k++) {
                 const int row = s * ORDER + m + k;
-                int port;
+                int from, port;
 
-                next[k] = STATE[row][0] * x[m] + STATE[row][1] * x[m + 1];
+                next[k] = 0;
+                for (from = 0; from < BLOCK; from++) {
+                    next[k] += STATE[row][from] * x[m + from];
+                }
                 for (port = 0; port < N_PORTS; port++) {
                     next[k] += ENTER[row][port] * in[port];
                     {% if has_anti_windup %}
@@ -212,8 +215,9 @@ int {{ name }}_step({{ name }}_state *state, const real sensor[{{ NAME }}_N_CHAN
                     {% endif %}
                 }
             }
-            x[m] = next[0];
-            x[m + 1] = next[1];
+            for (k = 0; k < BLOCK; k++) {
+                x[m + k] = next[k];
+            }
         }
     }
     {% else %}

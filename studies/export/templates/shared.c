@@ -13,6 +13,7 @@ static const uint16_t IS_USED{{ array(is_used) }};
 /* systems, states of each, sensors and actuators of each; control.links */
 #define N_SYSTEMS {{ blocks.first | length }}
 #define ORDER {{ order }}
+#define BLOCK {{ block }}
 #define N_PORTS {{ n_ports }}
 
 /* first sensor and actuator of each system */
