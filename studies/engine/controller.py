@@ -14,7 +14,7 @@ from jaxmodel.shaper import Taps
 from jaxmodel.state_space import StateSpace
 from studies.engine.blocks import ModalBlocks, modal_blocks
 from studies.engine.channels import ActiveChannels, fold
-from studies.engine.preflight import check_run, preflight
+from studies.engine.preflight import check_machine, preflight
 from studies.engine.runs import resolved_study
 from studies.errors import StudyError, field_error
 from studies.study.spec import Study
@@ -56,7 +56,7 @@ def fixed_controller(study: Study) -> FixedController:
     """
     _check_exportable(study)
     study = resolved_study(study)
-    structure, case = check_run(study)
+    structure, case = check_machine(study)
     prepared = preflight(structure, case)
     controller, taps = prepared.controller, prepared.taps
     if not controller.feedback.has_output:

@@ -32,7 +32,12 @@ from jaxmodel.shaper import Taps, last_sample
 from jaxmodel.simulate import steady_load
 from studies import config
 from studies.engine.programs import kept_jit
-from studies.engine.simplifications import warn_of_lumping, warn_of_mismatch, warn_of_patches
+from studies.engine.simplifications import (
+    warn_of_lumping,
+    warn_of_mismatch,
+    warn_of_patches,
+    warn_of_sizes,
+)
 from studies.errors import field_error
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.consistency import check_locked
@@ -146,6 +151,19 @@ def check_run(study: Study) -> tuple[Structure, Case]:
     Raises:
         StudyError: see `run_study`.
     """
+    return _checked(study, True)
+
+
+def check_machine(study: Study) -> tuple[Structure, Case]:
+    """The same for what reads machine and controller at the way-points, and runs no motion.
+
+    Raises:
+        StudyError: as `check_run`, but for the path between them, its duration and its windows.
+    """
+    return _checked(study, False)
+
+
+def _checked(study: Study, is_run: bool) -> tuple[Structure, Case]:
     config.require_configured()
     check_locked(study)
     structure, case = build_structure(study), as_arrays(build_case(study))
@@ -157,7 +175,7 @@ def check_run(study: Study) -> tuple[Structure, Case]:
     structure = structure._replace(substeps=substeps)
     for k, pose in enumerate(study.motion.waypoints):
         check_pose(study, f"motion.waypoints.{k}", pose, int(prepared.pose_status[k]))
-    if int(prepared.path_status) != status.OK:
+    if is_run and int(prepared.path_status) != status.OK:
         place = ", ".join(f"{x:.4g}" for x in prepared.path_pose)
         raise field_error(
             "motion.waypoints",
@@ -167,7 +185,8 @@ def check_run(study: Study) -> tuple[Structure, Case]:
             "m, m, rad",
         )
     _check_load(study, prepared)
-    _check_duration(study, structure, prepared)
+    if is_run:
+        _check_duration(study, structure, prepared)
     is_filtered = is_modal(structure) and structure.feedback != "none"
     if is_filtered and prepared.condition > study.metrics.condition_limit:
         raise field_error(
@@ -181,6 +200,7 @@ def check_run(study: Study) -> tuple[Structure, Case]:
     _check_rates(study, structure, prepared)
     if structure.feedback == "ideal":
         structure = structure._replace(substeps=_ideal_substeps(study, structure, case))
+    warn_of_sizes(study)
     warn_of_patches(study)
     warn_of_lumping(study, float(prepared.lumping))
     warn_of_mismatch(study, prepared.plant_omega, prepared.believed_omega)

@@ -1,14 +1,15 @@
-"""Warnings where a simplification that the study chose shows in its numbers."""
+"""Warnings of simplifications that show in a study's numbers, and of unlikely sizes."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from jaxmodel.beam import BASES
 from studies.errors import warn_of_model
 from studies.study.held_link import first_frequency
+from studies.study.paths import field_unit, field_value
 
 if TYPE_CHECKING:
     from studies.study.spec import Study
@@ -19,6 +20,53 @@ LUMPING_LIMIT = 2e-3
 PATCH_LIMIT = 0.02
 #: Most that the controller's modes may be away from the plant's without a word [1].
 MISMATCH_LIMIT = 0.02
+
+
+class Usual(NamedTuple):
+    """Sizes of a field on machines that can be built, and the units that are typed by mistake."""
+
+    low: float  # in the field's unit
+    high: float
+    units: dict[str, float]  # by name, in the field's unit
+
+
+_LENGTHS, _MODULI = {"mm": 1e-3, "cm": 1e-2, "µm": 1e-6}, {"GPa": 1e9, "MPa": 1e6, "kPa": 1e3}
+_DENSITIES, _MASSES = {"g/cm3": 1e3, "t/m3": 1e3, "mg/mm3": 1e3}, {"g": 1e-3}
+#: Of elastomers to diamond, of foam to osmium, of foils to beams.
+USUAL = {
+    "machine.platform_mass": Usual(5e-3, 100, _MASSES),
+    "machine.slider_mass": Usual(5e-3, 100, _MASSES),
+    "link.length": Usual(0.01, 5, _LENGTHS),
+    "link.thickness": Usual(5e-5, 0.05, _LENGTHS),
+    "link.width": Usual(5e-4, 0.5, _LENGTHS),
+    "link.density": Usual(50, 23e3, _DENSITIES),
+    "link.youngs_modulus": Usual(1e7, 1.3e12, _MODULI),
+    "patches.sensor_length": Usual(2e-4, 0.5, _LENGTHS),
+    "patches.actuator_length": Usual(2e-4, 0.5, _LENGTHS),
+    "patches.width": Usual(2e-4, 0.5, _LENGTHS),
+    "patches.thickness": Usual(5e-6, 5e-3, _LENGTHS),
+    "patches.density": Usual(500, 12e3, _DENSITIES),
+    "patches.youngs_modulus": Usual(1e8, 5e11, _MODULI),
+    "patches.d31": Usual(1e-12, 1e-9, {"pC/N": 1e-12, "nC/N": 1e-9}),
+}
+
+
+def warn_of_sizes(study: Study) -> None:
+    """Warn of numbers that no machine has, and name the unit in which one would."""
+    for name, usual in USUAL.items():
+        given = np.abs(np.ravel(field_value(study, name)))
+        wrong = given[(given > 0) & ((given < usual.low) | (given > usual.high))]
+        if not len(wrong):
+            continue
+        value, unit = float(wrong[0]), field_unit(name)
+        typed = [x for x, y in usual.units.items() if usual.low <= value * y <= usual.high]
+        meant = (
+            f"; if it is in {typed[0]}, write {value * usual.units[typed[0]]:g}" if typed else ""
+        )
+        warn_of_model(
+            f"{name} = {value:g} {unit} is far from what machines have, {usual.low:g} to "
+            f"{usual.high:g} {unit}{meant}"
+        )
 
 
 def warn_of_patches(study: Study) -> None:

@@ -10,13 +10,11 @@ import numpy as np
 from studies.errors import StudyError
 from studies.fitting.bench import Bench
 from studies.fitting.kinds.contract import Measurement, Residual
-from studies.fitting.spec import FitSpec, Prior
+from studies.fitting.spec import MOTIONS, FitSpec, Prior
 from studies.space.free import FreeNumbers
 
 #: Size of a residual from which the robust loss grows linearly, in standard deviations.
 SOFT = 2.0
-#: Kinds of measurements that take a run of the whole motion.
-MOTIONS = ("trace", "settling", "figures")
 
 
 class Problem(NamedTuple):

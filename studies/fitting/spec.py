@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, ValidationError
 
-from studies.engine.preflight import check_run
+from studies.engine.preflight import check_machine, check_run
 from studies.errors import StudyError, field_error, nearest, shown_name
 from studies.space.axes import Range
 from studies.space.free import (
@@ -42,7 +42,8 @@ Positive = Annotated[float, Field(ge=1e-30, le=1e12)]
 Percent = Annotated[float, Field(ge=1e-6, le=1000)]
 Share = Annotated[float, Field(ge=1e-6, lt=100)]
 
-
+#: Kinds of measurements that take a run of the whole motion.
+MOTIONS = ("trace", "settling", "figures")
 #: Fewer samples say nothing.
 FEWEST_SAMPLES = 20
 
@@ -374,13 +375,17 @@ def parse_fit(data: dict[str, Any], folder: str | Path = ".") -> FitSpec:
     """
     if "fit" not in data:
         raise StudyError("fit: missing; a fit is a study file with a section [fit]")
-    study = with_window(parse_study({name: value for name, value in data.items() if name != "fit"}))
+    study = parse_study({name: value for name, value in data.items() if name != "fit"})
     sizes = lengths(study.mechanism)
     try:
         fit = Fit.model_validate(as_tuples(data["fit"]), context=sizes)
     except ValidationError as error:
         raise explain(error, Fit, data["fit"], "fit", sizes) from None
-    check_run(study)
+    if any(written.get("kind") in MOTIONS for written in fit.data):
+        study = with_window(study)
+        check_run(study)
+    else:
+        check_machine(study)
     if 0 < fit.samples < FEWEST_SAMPLES:
         raise field_error("fit.samples", fit.samples, f"0, or {FEWEST_SAMPLES} to 1000000")
     free, priors = _free(fit, study)

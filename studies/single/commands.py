@@ -48,9 +48,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             from studies.single.documents import run_document
 
             print_document("simulate", run_document(run, uncontrolled_twin(run)))
-            return
-        _print_run(run, uncontrolled_twin(run), console)
-        _print_files(out, report, console)
+        else:
+            _print_run(run, uncontrolled_twin(run), console)
+            _print_files(out, report, console)
+        if run.status:
+            sys.exit(1)
 
     @app.command()
     def replay(

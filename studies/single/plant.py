@@ -15,7 +15,7 @@ from jaxmodel.laws import LAWS
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import SampledPlant, sampled_plant
-from studies.engine.preflight import check_run
+from studies.engine.preflight import check_machine
 from studies.engine.programs import kept_jit
 from studies.engine.runs import resolved_study
 from studies.errors import field_error
@@ -66,7 +66,7 @@ def plant_of(study: Study) -> NamedSystem:
         'actuator 1.1'
     """
     _check_sampled(study)
-    structure, case = check_run(study)
+    structure, case = check_machine(study)
     pose = np.array(study.motion.waypoints[0], float)
     found = jax.tree.map(np.asarray, _plant(structure._replace(n_steps=1, substeps=1), case, pose))
     a, b, c = _observed(found)
@@ -117,7 +117,7 @@ def controller_of(study: Study) -> NamedSystem:
     _check_sampled(study)
     if LAWS[study.control.law].is_switching:
         raise field_error("control.law", study.control.law, "a law whose channels act all at once")
-    structure, case = check_run(resolved_study(study))
+    structure, case = check_machine(resolved_study(study))
     law = _law(structure._replace(n_steps=1, substeps=1), case)
     a, b, c, d = (np.asarray(part) for part in law)
     n = len(c)  # the commands of the sample before are states, too

@@ -282,6 +282,15 @@ def test_an_audit_finds_a_falsified_derivative(monkeypatch, error):
 # --- single runs and certificates -----------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("ended", "wanted"), [(status.OK, 0), (status.DIVERGED, 1)])
+def test_a_run_that_is_not_ok_fails(capsys, monkeypatch, ended, wanted):
+    made = SimpleNamespace(status=ended)
+    monkeypatch.setattr(single_run, "simulate", lambda *_: made)
+    monkeypatch.setattr("studies.engine.runs.uncontrolled_twin", lambda run: None)
+    monkeypatch.setattr("studies.single.commands._print_run", lambda *_: None)
+    assert run(capsys, "simulate", "paper")[0] == wanted
+
+
 @pytest.mark.parametrize(("stored", "wanted"), [(status.OK, 0), (status.SATURATED, 1), (None, 0)])
 def test_a_replay_that_ends_otherwise_fails(capsys, monkeypatch, stored, wanted):
     again = SimpleNamespace(study=SimpleNamespace(title="this"), status=status.OK)

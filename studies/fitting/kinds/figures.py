@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -58,13 +59,8 @@ class Runs:
     """
 
     def __init__(self, study: Study, place: Place, moving: Sequence[str]) -> None:
-        """Arguments: what all runs share, what puts parameters among them, and their fields.
-
-        Raises:
-            StudyError: as `check_run`.
-        """
-        self._structure, self._numbers = smooth_run(study, moving)
-        self._place = place
+        """Arguments: what all runs share, what puts parameters among them, and their fields."""
+        self._study, self._moving, self._place = study, moving, place
         self._metrics: set[str] = set()
         self._switches: list[Switch] = []
         self._kept: tuple[bytes, bool, Any] = b"", False, None
@@ -90,15 +86,20 @@ class Runs:
             check_finished("figures", int(one))
         return metrics[: 1 + int(has_slopes)]
 
+    @cached_property
+    def _smooth(self) -> tuple[Structure, Numbers]:
+        return smooth_run(self._study, self._moving)
+
     def _run_all(self, values: np.ndarray, has_slopes: bool) -> Any:
         """Statuses, metrics by name, runs first, and perhaps their derivatives, (p, runs, ...)."""
-        structure = self._structure._replace(metrics=tuple(sorted(self._metrics)))
+        structure, numbers = self._smooth
+        structure = structure._replace(metrics=tuple(sorted(self._metrics)))
         rows = padded_rows(len(self._switches), lane_unit())
         masks = np.array([x.links for x in self._switches], float)[rows]
         modes = np.array([x.modes for x in self._switches])[rows]
         free, own = np.tile(values, (len(rows), 1)), (masks, modes)
         build = Placing(_switched_case, (structure, self._place))
-        run = fastest_function(structure, build, free, own, self._numbers)
+        run = fastest_function(structure, build, free, own, numbers)
         if not has_slopes:
             result = run.run(free, own)
             return result.status, _named(structure, result.metrics)

@@ -7,9 +7,14 @@ import numpy as np
 import pytest
 
 from jaxmodel.bases import find_bases
+from studies.engine.controller import fixed_controller
 from studies.engine.modes import machine_modes
 from studies.engine.preflight import check_run
-from studies.errors import ModelWarning
+from studies.engine.simplifications import warn_of_sizes
+from studies.errors import ModelWarning, StudyError
+from studies.fitting.measurements import make_bench, make_measurements
+from studies.fitting.spec import parse_fit
+from studies.single.plant import plant_of
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.held_link import first_frequency
 from studies.study.spec import parse_study
@@ -63,3 +68,41 @@ def test_controller_of_another_plant_is_a_mismatch():
         check_run(study({"basis": "loaded"}, **both))
         check_run(study({"basis": "loaded"}, stiffness_factor=1.2, **both))  # on purpose
         check_run(study({"feedback": "none"}, **both))
+
+
+@pytest.mark.parametrize(
+    ("section", "field", "value", "meant"),
+    [
+        ("link", "youngs_modulus", 70e3, "if it is in MPa, write 7e.10"),
+        ("link", "density", 2.75, "if it is in g/cm3, write 2750"),
+        ("link", "length", 9.9, "if it is in cm, write 0.099"),
+        ("link", "thickness", 1.2e-5, r"5e-05 to 0.05 m$"),
+        ("machine", "platform_mass", 250.0, "if it is in g, write 0.25"),
+        ("patches", "d31", -1e-13, "1e-12 to 1e-09 "),
+    ],
+)
+def test_sizes_that_no_machine_has_are_named_with_the_likely_unit(section, field, value, meant):
+    wrong = parse_study(with_sections(MACHINE, **{section: {field: value}}))
+    with pytest.warns(ModelWarning, match=rf"{section}.{field} = \S+ .*far from .*{meant}"):
+        warn_of_sizes(wrong)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", ModelWarning)
+        warn_of_sizes(study())
+
+
+def test_commands_that_run_nothing_check_no_residual_window():
+    """A drive that does not settle: machine and controller can be read, not the motion run."""
+    slow = parse_study(
+        with_sections(MACHINE, drive={"kd": 1e-3}, metrics={"residual_delay": "auto"})
+    )
+    with pytest.raises(StudyError, match="drive.kd.*settles"):
+        check_run(slow)
+    assert plant_of(slow).a.shape == plant_of(study()).a.shape
+    assert len(fixed_controller(slow).controller.feedthrough) == 3
+    free = {"link.youngs_modulus": {"from": 6e10, "to": 8e10}}
+    modes = {"kind": "modes", "frequency_hz": [114.0] * 3, "sigma_hz": 0.5}
+    spec = parse_fit(
+        with_sections(MACHINE, drive={"kd": 1e-3}, metrics={"residual_delay": "auto"})
+        | {"fit": {"free": free, "data": [modes]}}
+    )
+    assert make_measurements(spec, make_bench(spec))
