@@ -185,7 +185,8 @@ def measure(files: list[str]) -> None:
             seconds = SLACK.seconds * work * cost.seconds
             table[name] = Cost(math.ceil(SLACK.programs * cost.programs), math.ceil(seconds))
             print(name, *table[name], flush=True)
-    rows = [("file", *Cost._fields), *((x, *y) for x, y in sorted(table.items()))]
+    rows = [("file", *Cost._fields)]
+    rows += [(x, *map("{:g}".format, y)) for x, y in sorted(table.items())]
     text = "".join("\t".join(map(str, row)) + "\n" for row in rows)
     TABLE.write_text(text, encoding="utf-8")
 
