@@ -108,7 +108,8 @@ def summary_lines(done: ScreenOutcome) -> list[str]:
     half = quantity(done, clipped_quantile(done, 0.5))
     half += " or less" if tally.value.min() < 0 else ""  # negative values count as 0
     lines += _selection_lines(done, done.selection, half)
-    return lines + _edge_lines(done, done.selection) + _uncontrolled_line(done)
+    agreed = [] if done.agreement is None else [done.agreement.text]
+    return lines + _edge_lines(done, done.selection) + _uncontrolled_line(done) + agreed
 
 
 def _selection_lines(done: ScreenOutcome, selection: Selection, half: str) -> list[str]:

@@ -14,11 +14,12 @@ from rich.console import Console
 
 from jaxmodel import status
 from studies import config
+from studies.engine.fidelity import TRIED, Agreement, agreement
 from studies.engine.folder import locked_folder
 from studies.engine.progress import Phases, duration_text
 from studies.engine.sweep import interrupts
 from studies.screen.selection import Selection, select, uncontrolled
-from studies.screen.shards import ScreenRequest, shard_tally, table_of
+from studies.screen.shards import ScreenRequest, designs_table, shard_tally, table_of
 from studies.screen.stored import begin, write_best, write_tally
 from studies.screen.tally import LEFT_OUT, Tally, merged
 from studies.show.units import count_text
@@ -115,6 +116,7 @@ class ScreenOutcome(NamedTuple):
     is_interrupted: bool  # by Ctrl-C
     selection: Selection | None  # of the candidates; None: interrupted, or there are none
     uncontrolled: float | None  # the metric without control; None: not known
+    agreement: Agreement | None = None  # of linear and full model; None: not of the linear one
 
     @property
     def n_kept(self) -> int:
@@ -156,6 +158,7 @@ def run_screen(
         phases.begin(
             "screen", f"{screen.n_designs:,} designs in {count_text(screen.n_shards, 'shard')}"
         )
+        agreed = _agreement(screen)
         progress = ScreenProgress(phases, screen.n_designs, tally.n_designs)
         for shard, answer in screener.tallies(ShardWork(screen, left, progress, stop)):
             if isinstance(answer, str):
@@ -182,7 +185,25 @@ def run_screen(
         is_interrupted=is_interrupted,
         selection=selection,
         uncontrolled=without,
+        agreement=agreed,
     )
+
+
+def _agreement(screen: ScreenRequest) -> Agreement | None:
+    """Whether the linear model ranks designs of the screen as the full one does.
+
+    Raises:
+        StudyError: it does not.
+    """
+    if screen.spec.sweep.fidelity != "linear":
+        return None
+    rng, n = np.random.default_rng(screen.spec.sweep.seed), screen.n_designs
+    rows = rng.permutation(n) if n < 100 * TRIED else np.unique(rng.integers(0, n, 2 * TRIED))
+    table = designs_table(screen, np.sort(rows[: 2 * TRIED]))
+    found = agreement(screen.spec, table, screen.by)
+    if found is not None:
+        found.check("Rank by another metric, or screen with --fidelity full.")
+    return found
 
 
 def all_failed(tally: Tally) -> str:

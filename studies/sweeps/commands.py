@@ -200,6 +200,14 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         )
 
         data, name = read_sweep(folder), by.removeprefix("-")
+        agreed = ""
+        if data.spec.sweep.fidelity == "linear":
+            start()
+            from studies.engine.fidelity import agreement
+
+            if found := agreement(data.spec, data.table, by):
+                found.check('Rank by another metric, or run the sweep with fidelity = "full".')
+                agreed = found.text
         if as_json:
             from studies.sweeps.documents import best_document
 
@@ -215,6 +223,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             return
         cases = ranked_cases(data, by, subject_to, count)
         print_uncontrolled(data, name, console)
+        if agreed:
+            console.print(agreed, soft_wrap=True)
         console.print(f"by {name}, {direction(by)} first, {counted_text(data, name)}:")
         print_cases(data, cases, [name], console)
         print_left_out(data, console)

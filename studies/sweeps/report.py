@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxmodel import status
+from studies.engine.fidelity import agreement
 from studies.engine.results import (
     SweepData,
     counted_links,
@@ -153,6 +154,7 @@ def report(
         best=_best(data, metric),
         uncontrolled=uncontrolled_text(data, metric),
         screen=check_screen(data),
+        agreed=agreement(spec, data.table, metric) if spec.sweep.fidelity == "linear" else None,
         root=spec.root,
         method_text=_method_text,
         shown_as=SHOWN_AS,

@@ -15,6 +15,7 @@ import pytest
 
 from jaxmodel import status
 from studies.cli import main
+from studies.engine.fidelity import Agreement
 from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import run_uncontrolled
 from studies.engine.sweep import run_sweep
@@ -364,12 +365,12 @@ def test_links_that_a_machine_lacks_are_refused():
             small_spec(SWEEP | {"links": links})
 
 
-KINDS, GAINS = ["sampled", "none"], [0.5, 1.0]
+KINDS, MASSES = ["sampled", "none"], [0.0, 0.1]
 
 
 def of_kinds(out, margin):
     """Designs with and without a sampled loop, and their report."""
-    axes = {"control.feedback": KINDS, "control.gain_factor": GAINS}
+    axes = {"control.feedback": KINDS, "load.mass": MASSES}
     sweep = {"method": "grid", "axes": axes, "metrics": ["residual_rms"], "by": SWEEP["by"]}
     done = screened(out, small_spec(sweep), margin=margin)
     write_screen_report(out, done)
@@ -583,15 +584,15 @@ def test_too_many_designs_are_refused_before_any_runs():
 def test_report_of_axes_of_text(tmp_path):
     done, text = of_kinds(tmp_path, 0.0)
     axes, tally = done.screen.axes, done.tally
-    assert axes.names == ("control.feedback", "control.gain_factor")
+    assert axes.names == ("control.feedback", "load.mass")
     assert axes.labels[0].tolist() == sorted(KINDS) and not len(axes.labels[1])
     # each kind's two values are where they belong
     for label, counts in zip(axes.labels[0], tally.sketch[axes.part(0)], strict=True):
-        values = tally.value[[KINDS[row // len(GAINS)] == label for row in tally.row]]
+        values = tally.value[[KINDS[row // len(MASSES)] == label for row in tally.row]]
         assert counts.sum() == len(values) == 2
         for value, share in zip(np.sort(values), (0.5, 1.0), strict=True):
             np.testing.assert_allclose(quantile(counts, share), value, rtol=0.02)
-    kind = KINDS[tally.row[0] // len(GAINS)]
+    kind = KINDS[tally.row[0] // len(MASSES)]
     assert re.search(
         rf"\| control\.feedback \|.*\| 0 \| {tally.row[0]} \|[^\n]*\| {kind} \|", text, re.DOTALL
     )
@@ -691,16 +692,25 @@ def test_report_says_what_was_found(whole):
     assert lines[1].startswith(f"the best {KEEP} by residual_rms[link=2][station=2]")
     alone = run_uncontrolled(SPEC.study, is_linear=True).result.metrics.residual_rms[1, 1]
     assert done.uncontrolled == pytest.approx(float(alone), rel=1e-9)
-    assert lines[-1].startswith("residual_rms[link=2][station=2] of the baseline without control")
+    assert lines[-2].startswith("residual_rms[link=2][station=2] of the baseline without control")
+    assert re.fullmatch(r"\d+ random designs by .* 1.00, 5 of the best 5 in common", lines[-1])
     value = done.selection.value
     for free, told in (
         (0.9 * value[0], "; no design that is kept is below it"),
         (np.mean(value[[3, 4]]), f"; {KEEP - 4} kept are not below it"),
         (1.1 * value[-1], ""),
     ):
-        line = summary_lines(done._replace(uncontrolled=free))[-1]
+        line = summary_lines(done._replace(uncontrolled=free, agreement=None))[-1]
         assert line.partition(", by the linear model: ")[2].partition("µm")[2] == told
     assert {"values.png", "influence.png"} <= {path.name for path in out.iterdir()}
+
+
+def test_a_metric_that_the_linear_model_ranks_otherwise_is_refused(tmp_path, monkeypatch):
+    poor = Agreement("structural_peak", 32, 0.53, 4)
+    monkeypatch.setattr("studies.screen.run.agreement", lambda *_: poor)
+    with pytest.raises(StudyError, match="structural_peak 0.53, .* screen with --fidelity full"):
+        screened(tmp_path / "out")
+    screened(tmp_path / "full", fidelity="full")  # nothing to compare
 
 
 def test_the_command(tmp_path, capsys):

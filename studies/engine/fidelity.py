@@ -1,0 +1,108 @@
+"""Whether the linear model ranks the designs of a space as the full model does.
+
+Its accuracy is that of small motions: residual vibration agrees, peaks near a singular pose may
+not. A few random designs of the user's own space, run by both models, tell.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import NamedTuple
+
+import numpy as np
+from rich.console import Console
+from scipy.stats import spearmanr
+
+from jaxmodel import status
+from jaxmodel.metrics import METRICS
+from studies.engine.chunks import Done, LocalRunner
+from studies.engine.columns import labelled
+from studies.engine.plan import local_layout, plan_groups
+from studies.engine.progress import Phases, Reporter
+from studies.engine.results import SweepData, direction, metric_values
+from studies.engine.stored import chunk_arrays
+from studies.errors import StudyError
+from studies.space.spec import SweepSpec
+from studies.space.table import CaseTable
+
+#: Random designs that are run by both models, and the fewest of them that say something.
+TRIED, FEWEST = 32, 8
+#: Least rank correlation with which designs are ranked by the linear model [1].
+LEAST = 0.8
+
+
+class Agreement(NamedTuple):
+    """How two models rank the same designs."""
+
+    by: str  # metric, or an entry of it
+    n: int  # designs that end well in both
+    correlation: float  # of their ranks [1], NaN: nothing to compare
+    recalled: int  # of the best quarter by the full model, those that the linear one has, too
+
+    @property
+    def is_poor(self) -> bool:
+        """Whether the linear model ranks otherwise."""
+        return self.correlation < LEAST
+
+    @property
+    def text(self) -> str:
+        """In one sentence."""
+        if np.isnan(self.correlation):
+            return f"{self.n} random designs end well in both models: too few to compare {self.by}"
+        return (
+            f"{self.n} random designs by the linear and the full model: rank correlation of "
+            f"{self.by} {self.correlation:.2f}, {self.recalled} of the best {self.n // 4} in "
+            "common"
+        )
+
+    def check(self, remedy: str) -> None:
+        """Refuse to rank by a model that ranks otherwise.
+
+        Raises:
+            StudyError: with what helps.
+        """
+        if self.is_poor:
+            raise StudyError(f"{self.text}; allowed: {LEAST:g} or more. {remedy}")
+
+
+def agreement(spec: SweepSpec, table: CaseTable, by: str) -> Agreement | None:
+    """Compare the models on random designs of a table; None: not by what runs find.
+
+    Args:
+        spec: the sweep.
+        table: its designs, or some of them.
+        by: what they are ranked by.
+    """
+    entry = by.removeprefix("-")
+    metric = entry.partition("[")[0]
+    if metric not in METRICS:
+        return None
+    rows = np.random.default_rng(spec.sweep.seed).permutation(len(table))[:TRIED]
+    part = table.rows(np.sort(rows))
+    linear, full = (_values(spec, part, metric, entry, x) for x in (True, False))
+    is_there = np.isfinite(linear) & np.isfinite(full)
+    sign = -1 if direction(by) == "largest" else 1
+    linear, full = sign * linear[is_there], sign * full[is_there]
+    count = len(full)
+    if count < FEWEST or np.ptp(full) == 0 or np.ptp(linear) == 0:
+        return Agreement(entry, count, np.nan, 0)
+    best = [set(np.argsort(x, kind="stable")[: count // 4].tolist()) for x in (linear, full)]
+    return Agreement(entry, count, float(spearmanr(linear, full).statistic), len(best[0] & best[1]))
+
+
+def _values(
+    spec: SweepSpec, table: CaseTable, metric: str, entry: str, is_linear: bool
+) -> np.ndarray:
+    """What designs are ranked by, NaN where the run is not ok, (n,)."""
+    values, rows = np.full(len(table), np.nan), np.arange(len(table))
+    groups = plan_groups(table, rows, local_layout, (metric,), is_linear, is_judged=False)
+    with Phases(Console(quiet=True), ("compile", "run"), is_quiet=True) as phases:
+        reporter = Reporter(phases, "run", len(table), 0, len(groups))
+        for done in LocalRunner().run(table, groups, reporter, threading.Event()):
+            assert isinstance(done, Done)  # only workers of a cluster give chunks up
+            arrays = chunk_arrays(table, done, [metric])
+            variables = {name: labelled(name, data) for name, data in arrays.items()}
+            data = SweepData(variables, {}, spec, table.rows(done.chunk.rows))
+            found = np.asarray(metric_values(data, entry), float)
+            values[done.chunk.rows] = np.where(arrays["status"] == status.OK, found, np.nan)
+    return values
