@@ -89,9 +89,7 @@ class SweepData:
 
 def swept_names(data: SweepData) -> list[str]:
     """What varies, as variables of the file, in the order of the sweep; labels stand for fields."""
-    columns = data.table.columns
-    labelled = {LABELS[name] for name in columns if name in LABELS}
-    return [name for name in columns if name not in labelled]
+    return data.table.axes
 
 
 def as_sweep(sweep: SweepData | str | Path) -> SweepData:
@@ -226,6 +224,9 @@ def metric_values(data: SweepData, name: str) -> np.ndarray:
     Raises:
         StudyError: unknown name or entry.
     """
+    labels = [x for x, field in LABELS.items() if field == name and x in data.variables]
+    if labels and data[name].ndim > 1:
+        name = labels[0]
     named = NAMED_INDEX.findall(name)
     if named:
         return _of_axes(data, NAMED_INDEX.sub("", name), named)

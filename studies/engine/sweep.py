@@ -44,6 +44,7 @@ from studies.errors import StudyError
 from studies.publish import shown
 from studies.space.spec import SweepSpec
 from studies.space.table import CaseTable, build_table
+from studies.study.fields import idle_axes
 
 
 def sweep_phases(spec: SweepSpec) -> tuple[str, ...]:
@@ -304,7 +305,8 @@ def _headline(table: CaseTable, groups: list[Group], n_before: int) -> str:
     if table.n_dropped:
         text += f" ({table.n_dropped} left out by where)"
     if table.n_double:
-        text += f" ({table.n_double} duplicates left out)"
+        reasons = idle_axes(table.study, table.columns)
+        text += f" ({'; '.join([f'{table.n_double} duplicates left out', *reasons])})"
     if n_before:
         text += f", {n_before} of them already computed"
     chunks = sum(len(group.chunks()) for group in groups)

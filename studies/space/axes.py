@@ -16,7 +16,7 @@ import numpy as np
 from jaxmodel.laws.state_space import STATE_SPACE
 from studies.errors import field_error, nearest, shown_name
 from studies.study.consistency import patch_centers, patch_pitch
-from studies.study.fields import Columns
+from studies.study.fields import Columns, column_of
 from studies.study.paths import checked_value, field_choices, known_field
 from studies.study.spec import Study
 
@@ -118,21 +118,6 @@ def build_axis(name: str, written: Any, study: Study, path: str) -> Axis:
     if name in special:
         return special[name](written, study, full)
     return _field_axis(name, written, study, full)
-
-
-def column_of(values: list[Any]) -> np.ndarray:
-    """Values of one field as a column: an array if they have one shape, otherwise of objects."""
-    if isinstance(values[0], (tuple, list)) or any(isinstance(v, tuple) for v in values):
-        try:
-            array = np.array(values)
-        except ValueError:
-            array = np.empty(0, object)
-        if array.dtype.kind in "bif" and array.ndim > 1 and len(array) == len(values):
-            return array
-        array = np.empty(len(values), object)
-        array[:] = values
-        return array
-    return np.array(values)
 
 
 def _field_axis(name: str, written: Any, study: Study, path: str) -> Axis:

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from studies.errors import StudyError
-from studies.space.axes import LIMIT, READY_MADE, Axis, build_axis, column_of
+from studies.space.axes import LIMIT, READY_MADE, Axis, build_axis
 from studies.space.methods import METHODS, SamplingRequest
 from studies.space.spec import BlockNode
-from studies.study.fields import Columns
+from studies.study.fields import Columns, column_of
 from studies.study.paths import checked_value, known_field
 from studies.study.spec import Study
 

@@ -23,7 +23,7 @@ from studies.space.designs import design_of
 from studies.space.spec import SweepSpec
 from studies.study.consistency import SAMPLE_LIMIT
 from studies.study.entries import entry_sizes
-from studies.study.fields import Columns, Fields, padded, row_keys
+from studies.study.fields import Columns, Fields, acting_columns, padded, row_keys
 from studies.study.paths import (
     Parts,
     as_list,
@@ -65,6 +65,12 @@ class CaseTable:
     def n_double(self) -> int:
         """Number of rows of the design that duplicate an earlier one."""
         return len(self.origin) - len(self)
+
+    @property
+    def axes(self) -> list[str]:
+        """What varies, in the order of the sweep; labels stand for their fields."""
+        labelled = {LABELS[name] for name in self.columns if name in LABELS}
+        return [name for name in self.columns if name not in labelled]
 
     @property
     def fields(self) -> dict[str, np.ndarray]:
@@ -120,7 +126,8 @@ def designs(table: CaseTable, environments: Iterable[str]) -> np.ndarray:
     if not outside:
         return np.arange(len(table))
     codes = [np.zeros(len(table), int)]
-    codes += [_codes(column) for name, column in table.columns.items() if name not in outside]
+    acting = acting_columns(table.study, table.columns)
+    codes += [_codes(column) for name, column in acting.items() if name not in outside]
     return np.unique(np.stack(codes, axis=1), axis=0, return_inverse=True)[1].ravel()
 
 
@@ -155,7 +162,7 @@ def build_table(spec: SweepSpec, rows: np.ndarray | None = None, has_ids: bool =
                 "best of more"
             )
         rows = np.arange(design.size)
-    columns = design.rows(rows)
+    columns = _with_subsets(design.rows(rows))
     environment_columns(spec.sweep.environments, columns)
     _check_shapes(columns)
     _check_samples(spec.study, columns)
@@ -191,9 +198,19 @@ def build_table(spec: SweepSpec, rows: np.ndarray | None = None, has_ids: bool =
     return table.rows(single, np.searchsorted(single, first[which]))
 
 
+def _with_subsets(columns: Columns) -> Columns:
+    """With names of the links that are controlled, where lists of switches vary."""
+    if "control.links" not in columns or "link_subsets" in columns:
+        return columns
+    numbers = (np.flatnonzero(row) + 1 for row in columns["control.links"])
+    names = ["+".join(map(str, one)) or "none" for one in numbers]
+    return {**columns, "link_subsets": np.array(names)}
+
+
 def _keys(table: CaseTable) -> np.ndarray:
     """Bytes that are equal for cases with equal columns, (n,)."""
-    columns = [table.repeat, *table.fields.values()]
+    acting = acting_columns(table.study, table.fields)
+    columns = [table.repeat, *acting.values()]
     return row_keys(_codes(x) if x.dtype.kind not in "bif" else x for x in columns)
 
 
@@ -320,8 +337,8 @@ def as_python(value: Any) -> Any:
 
 
 def case_ids(study: Study, columns: Columns, repeat: np.ndarray) -> np.ndarray:
-    """Hash of all parameters of each case, 16 hexadecimal digits as bytes, (n,)."""
-    varying = _varying_text(study, columns)
+    """Hash of all parameters of each case that act in it, 16 hexadecimal digits as bytes, (n,)."""
+    varying = _varying_text(study, acting_columns(study, columns))
     varying["repeat"] = [str(k) for k in repeat.tolist()]
     data = study.model_dump(mode="json")
     fixed = {

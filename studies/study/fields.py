@@ -12,10 +12,25 @@ from typing import Any
 
 import numpy as np
 
-from studies.study.paths import field_value, parse_entry
-from studies.study.spec import Study
+from studies.study.paths import field_value, known_field, own_place, parse_entry
+from studies.study.spec import OWN_FIELDS, Study
 
 Columns = Mapping[str, np.ndarray]
+
+
+def column_of(values: list[Any]) -> np.ndarray:
+    """Values of one field as a column: an array if they have one shape, otherwise of objects."""
+    if isinstance(values[0], (tuple, list)) or any(isinstance(v, tuple) for v in values):
+        try:
+            array = np.array(values)
+        except ValueError:
+            array = np.empty(0, object)
+        if array.dtype.kind in "bif" and array.ndim > 1 and len(array) == len(values):
+            return array
+        array = np.empty(len(values), object)
+        array[:] = values
+        return array
+    return np.array(values)
 
 
 def padded(values: list[Any], n_links: int) -> np.ndarray:
@@ -135,3 +150,77 @@ class Fields:
         raw = self.raw(field)
         distinct, inverse = np.unique(raw.astype(str), return_inverse=True)
         return np.array([names.index(name) for name in distinct])[inverse]
+
+
+# --- where nothing depends on a field -------------------------------------------------------------
+# What is listed here is proved by the equations; what only seldom matters is not. A law from a
+# user's file may read any field, so that nothing is idle where one takes part.
+
+_LAWS = {"imsc", "srf", "lqr", "modified_imsc", "ppf", "observer", "lqg", "state_space"}
+_GAINS = (
+    *("control.velocity_gain", "control.position_gain", "control.gain_", "control.laws."),
+    *("control.ratios", "control.ratio_exponent", "control.mode_mask", "control.damping"),
+    *("control.pole_", "control.feedthrough_factor", "control.notch_depth", "control.notch_width"),
+)
+Rule = tuple[str, tuple[Any, ...], tuple[str, ...]]
+#: Where a field has one of these values, nothing depends on fields that begin so.
+_RULES: tuple[Rule, ...] = (
+    ("control.links", (False,), _GAINS),
+    ("control.feedback", ("none",), _GAINS),
+    ("control.notch_hz", (0.0,), ("control.notch_depth", "control.notch_width")),
+    ("shaper.kind", ("none", "zv", "zvd", "zvdd"), ("shaper.tolerance",)),
+    ("shaper.kind", ("none",), ("shaper.frequencies_hz", "shaper.damping_ratio", "shaper.split")),
+    ("electronics.estimator", ("modal_phase",), ("electronics.difference_cutoff_hz",)),
+    ("electronics.estimator", ("difference",), ("electronics.lowpass_", "electronics.highpass_hz")),
+    ("patches.sensor", ("piezo",), ("patches.gauge_",)),
+    ("patches.sensor", ("strain_gauge",), ("electronics.sensor_highpass_hz",)),
+    ("drive.coulomb_friction", (0.0,), ("drive.friction_speed",)),
+)
+
+
+def idle_cases(study: Study, columns: Columns, name: str) -> tuple[np.ndarray, str]:
+    """Cases in which nothing depends on a column, (n,) or (1,), and what says so.
+
+    Args:
+        study: values of all fields that do not vary.
+        columns: the others.
+        name: of one of them.
+    """
+    fields, why = Fields(study, columns), ""
+    is_idle: np.ndarray = np.zeros(1, bool)
+    if not {*fields.raw("control.law").tolist()} <= _LAWS:
+        return is_idle, why
+    for field, values, beginnings in (*_RULES, *_of_parts(name)):
+        if name.startswith(beginnings):
+            has = fields.raw(field) if isinstance(values[0], str) else fields.numbers(field)
+            is_met = np.isin(has, values).reshape(len(has), -1).all(axis=1)
+            if is_met.any():
+                known = np.unique(has[is_met]).tolist() if has.dtype.kind == "U" else values
+                is_idle, why = is_idle | is_met, f"{field} {' or '.join(map(str, known)).lower()}"
+    return is_idle, why
+
+
+def _of_parts(name: str) -> list[Rule]:
+    """Own fields of a law, drive or mechanism: where another one is selected."""
+    place = own_place(name)
+    own = name.removeprefix(f"{place}.").partition(".")[0]
+    others = [part.name for part in OWN_FIELDS[place].values() if part.name != own] if place else []
+    return [(place.removesuffix("s"), tuple(others), (f"{place}.",))] if others else []
+
+
+def idle_axes(study: Study, columns: Columns) -> list[str]:
+    """A line for each column that nothing depends on in any case."""
+    found = {name: idle_cases(study, columns, name) for name in columns}
+    return [f"no metric depends on {x} with {y[1]}" for x, y in found.items() if y[0].all()]
+
+
+def acting_columns(study: Study, columns: Columns) -> dict[str, np.ndarray]:
+    """The columns with the study's value wherever nothing depends on theirs."""
+    changed = dict(columns)
+    for name, column in columns.items():
+        is_idle, _ = idle_cases(study, columns, name)
+        if is_idle.any():
+            rows = zip(column.tolist(), np.broadcast_to(is_idle, len(column)), strict=True)
+            value = known_field(name, study)
+            changed[name] = column_of([value if idle else x for x, idle in rows])
+    return changed

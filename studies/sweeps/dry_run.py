@@ -12,6 +12,7 @@ from studies.errors import StudyError
 from studies.show.listing import Rows, print_rows
 from studies.show.units import count_text
 from studies.space.table import CaseTable, case_study
+from studies.study.fields import idle_axes
 from studies.study.paths import field_unit, parse_entry
 from studies.sweeps.records import Record
 from studies.sweeps.show import short_value
@@ -24,6 +25,8 @@ def print_plan(plan: Plan, console: Console) -> None:
         f"{len(table)} cases ({table.n_dropped} left out by where, {table.n_double} duplicates, "
         f"{plan.n_before} already computed)"
     )
+    for line in idle_axes(table.study, table.columns):
+        console.print(line)
     print_rows(axis_rows(table), console)
     for group in plan.groups:
         layout, structure = group.layout, group.structure
@@ -38,7 +41,7 @@ def print_plan(plan: Plan, console: Console) -> None:
             f"{count_text(layout.lanes, 'lane')}"
         )
     sample = sample_record(table)
-    values = ", ".join(f"{name} = {short_value(sample[name])}" for name in table.columns)
+    values = ", ".join(f"{name} = {short_value(sample[name])}" for name in table.axes)
     console.print(f"sample: case {sample['case']}, id {sample['case_id']}: {values}")
     if fault := sample_fault(table):
         console.print(f"the sample cannot run: {fault}")
@@ -96,8 +99,8 @@ def sample_fault(table: CaseTable) -> str:
 def axis_records(table: CaseTable) -> list[Record]:
     """Number of values of each column of a sweep, and their range, None for what has none."""
     records = []
-    for name, column in table.columns.items():
-        entry = parse_entry(name)
+    for name in table.axes:
+        entry, column = parse_entry(name), table.columns[name]
         is_numeric = column.dtype.kind in "fi"
         records.append(
             {

@@ -9,9 +9,8 @@ import scipy
 
 from studies.engine.chunks import distinct_loops
 from studies.show.units import count_text
-from studies.space.axes import column_of
 from studies.study.cases import build_cases, build_structure
-from studies.study.fields import Columns
+from studies.study.fields import Columns, column_of
 from studies.study.paths import as_tuples, known_field, set_values
 from studies.study.spec import Study, parse_study
 from studies.tuning.spec import Family, TuneSpec, others

@@ -259,7 +259,8 @@ def test_each_case_takes_the_plant_steps_that_it_takes_alone(tmp_path):
 
 
 def test_static_choices_make_groups():
-    axes = {"control.feedback": ["none", "sampled"], "gain": [0.1, 1.0], "plant_modes": [2, 3]}
+    masses = [0.0, 0.1]
+    axes = {"control.feedback": ["none", "sampled"], "load.mass": masses, "plant_modes": [2, 3]}
     groups = make_plan(small_spec({"axes": axes})).groups
     assert {group.structure.feedback for group in groups} == {"none", "sampled"}
     assert all(len(group.rows) == 4 and group.structure.n_modes == 3 for group in groups)
