@@ -36,6 +36,7 @@ from studies.sweeps.show import (
     margin_warning,
     ranked_cases,
     ranking,
+    recommended,
     requirement,
     resolution_warning,
     shown_metric,
@@ -123,7 +124,7 @@ def _strangers(folder: Path, data: SweepData) -> tuple[str, ...]:
 def _warnings(data: SweepData, rank: str) -> tuple[str, ...]:
     """What to know before acting on the best cases."""
     try:
-        best = ranked_cases(data, rank)
+        best = recommended(data, rank)  # as the page begins
     except StudyError:  # none is ok
         return ()
     linear = "Figures are those of the linear model, drawn motions of the full one."

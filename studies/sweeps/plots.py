@@ -7,6 +7,7 @@ numeric grid: heat map. x with few values: lines, one per hue. Otherwise points,
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import matplotlib
@@ -25,7 +26,7 @@ from studies.space.axes import SHOWN_AS
 from studies.space.spec import BlockNode
 from studies.study.margin import ENOUGH, HIGHEST
 from studies.sweeps.records import MARGIN
-from studies.sweeps.show import label, recommended, shown_metric, shown_value
+from studies.sweeps.show import label, left_out_text, recommended, shown_metric, shown_value
 
 #: More distinct values than this are no grid.
 FEW = 60
@@ -34,6 +35,7 @@ N_PLACEMENTS = 15
 MAP = "viridis"
 #: The best cases among others.
 BEST = "#D00000"
+RING: Any = {"color": "black", "markerfacecolor": "none", "markeredgewidth": 1.0, "zorder": 3}
 #: From so many values on, the largest 2 % do not set the limits of an axis.
 MANY = 50
 VOLTAGE = "peak_voltage"
@@ -41,6 +43,10 @@ VOLTAGE = "peak_voltage"
 MARKERS = ("o", "^", "s")
 #: More groups than this have no bands, which would cover one another.
 MOST_BANDS = 4
+#: Of parallel coordinates, the lines drawn, and different lists with a place on an axis.
+MOST_LINES, MOST_LISTS = 3000, 12
+#: Characters of a line of notes.
+LINE = 120
 
 
 def plot(sweep: SweepData | str | Path, x: str | None, y: str, hue: str | None = None) -> Figure:
@@ -74,8 +80,9 @@ def plot(sweep: SweepData | str | Path, x: str | None, y: str, hue: str | None =
             chosen = chosen & np.isfinite(there)
         if not chosen.any():
             raise StudyError(f"{option} {name}: no case of status ok has it")
-    across = shown_metric(data, x)[chosen]
-    group = None if hue is None else shown_metric(data, hue)[chosen]
+    is_run = chosen | (data["status"] >= 0) & (data["status"] != LEFT_OUT)
+    whole, color = _drawn(data, x), None if hue is None else _drawn(data, hue)
+    across, group = whole[chosen], None if color is None else color[chosen]
     shown = shown_metric(data, y)[chosen]
     with figures.styled():
         figure, ax = figures.one_panel(4.2)
@@ -87,8 +94,10 @@ def plot(sweep: SweepData | str | Path, x: str | None, y: str, hue: str | None =
             return figure
         ax.set_ylabel(label(data, y))
         if len(np.unique(across)) <= min(FEW, max(len(across) // 2, 12)):
-            _lines(ax, across, shown, group, hue)
-            if is_log(data, x) or _is_geometric(np.unique(across)):
+            is_run &= (whole == whole) & (True if color is None else color == color)
+            value = np.where(chosen, shown_metric(data, y), np.nan)[is_run]
+            _lines(ax, whole[is_run], value, None if color is None else color[is_run], hue)
+            if is_log(data, x) or _is_geometric(np.unique(whole[is_run])):
                 figures.log_scale(ax, "x")
         else:
             best = np.isin(np.flatnonzero(chosen), recommended(data, y))
@@ -99,6 +108,14 @@ def plot(sweep: SweepData | str | Path, x: str | None, y: str, hue: str | None =
             if x == MARGIN:
                 ax.axvline(ENOUGH, color="black", linewidth=0.8, linestyle=":")
     return figure
+
+
+def _drawn(data: SweepData, name: str) -> np.ndarray:
+    """Values of an axis or metric, of a switch as texts, (n,)."""
+    entry = SHOWN_AS.get(name, name).partition("[")[0]
+    is_switch = entry in data.table.columns and data.table.columns[entry].dtype == bool
+    values = shown_metric(data, name)
+    return np.where(values, "on", "off") if is_switch and values.dtype.kind in "bi" else values
 
 
 def front(data: SweepData, y: str) -> Figure:
@@ -130,17 +147,7 @@ def front(data: SweepData, y: str) -> Figure:
         # margins are the same if four digits are
         same = np.array([float(f"{x:.4g}") for x in margin])
         best = pareto_front(np.stack([-same, value], axis=1))
-        ax.plot(margin[best], value[best], "-", color="black", linewidth=0.8, zorder=3)
-        ax.plot(
-            margin[best],
-            value[best],
-            "o",
-            color="black",
-            markerfacecolor="none",
-            markeredgewidth=1.2,
-            markersize=6,
-            zorder=3,
-        )
+        ax.plot(margin[best], value[best], "-o", linewidth=0.8, markersize=6, **RING)
         ax.axvline(ENOUGH, color="black", linewidth=0.8, linestyle=":")
         ends = f" ({HIGHEST:g}: that or more)" if margin.max(initial=0.0) >= HIGHEST else ""
         ax.set(xlabel=f"gain margin{ends}", ylabel=label(data, y))
@@ -185,20 +192,21 @@ def _scale_ordinate(ax: Axes, value: np.ndarray) -> None:
         ax.set_title(f"{beyond} above {top:.3g} not shown", fontsize=figures.SMALL, loc="right")
 
 
-def _note_left_out(figure: Figure, data: SweepData, chosen: np.ndarray) -> None:
-    n_screened = int(np.sum(data["status"] == LEFT_OUT))
-    n_left, parts = int(np.sum(~chosen)) - n_screened, []
+def _note_left_out(figure: Figure, data: SweepData, chosen: np.ndarray, more: str = "") -> None:
+    n_screened, parts = int(np.sum(data["status"] == LEFT_OUT)), []
+    is_left = ~chosen & (data["status"] != LEFT_OUT)
     if n_screened:
         parts.append(f"the screen left out {n_screened:,} of {len(chosen):,} cases")
-    if n_left:
-        parts.append(f"{n_left:,} of {len(chosen):,} cases are unstable or failed and are left out")
+    if is_left.any():
+        why = left_out_text(data, is_left)
+        parts.append(f"{np.sum(is_left):,} of {len(chosen):,} cases are left out ({why})")
     if MARGIN in data.variables:
         n_low = int(np.sum(data[MARGIN][chosen] < ENOUGH))
         if n_low:
             shown = int(np.sum(chosen))
             parts.append(f"{n_low:,} of the {shown:,} shown have a gain margin below {ENOUGH:g}")
-    if parts:
-        figure.suptitle("; ".join(parts), fontsize=figures.SMALL, x=0.01, ha="left")
+    if text := "; ".join(filter(None, [*parts, more])):
+        figure.suptitle(fill(text, LINE), fontsize=figures.SMALL, x=0.01, ha="left")
 
 
 def save_plot(figure: Figure, path: Path) -> None:
@@ -265,13 +273,20 @@ def _is_geometric(values: np.ndarray) -> bool:
 def _lines(
     ax: Axes, across: np.ndarray, value: np.ndarray, group: np.ndarray | None, hue: str | None
 ) -> None:
-    groups = [None] if group is None else _distinct(group)
+    """Medians of the values that are there; behind them, the share of those that are NaN."""
+    is_text, is_there = across.dtype.kind in "UOb", np.isfinite(value)
+    places = np.array(_distinct(across))  # texts in the order of the file, on one axis
+    share = np.array([np.mean(~is_there[across == x]) for x in places])
+    if share.any():  # what is left of such a value may be its lucky cases
+        at, height = range(len(places)) if is_text else places, ax.get_xaxis_transform()
+        ax.vlines(at, 0, share, color="#888888", alpha=0.3, linewidth=7, transform=height)
+        told = f"grey: share left out of the medians, up to {100 * share.max():.0f} %"
+        ax.set_title(told, fontsize=figures.SMALL, loc="left")
+    groups = [None] if group is None else _distinct(group[is_there])
     if len(groups) > 12:
         groups = [groups[k] for k in np.linspace(0, len(groups) - 1, 12).astype(int)]
     for k, name in enumerate(groups):
-        part = np.ones(len(across), bool) if group is None else group == name
-        is_text = across.dtype.kind in "UOb"
-        places = np.array(_distinct(across))  # texts in the order of the file, on one axis
+        part = is_there if group is None else is_there & (group == name)
         at = np.array([x for x in places if np.any(across[part] == x)])
         inside = [value[part][across[part] == x] for x in at]
         middle = [np.median(v) for v in inside]
@@ -292,13 +307,14 @@ def _lines(
             elif len(groups) <= MOST_BANDS:
                 ax.fill_between(position, low, high, color=style["color"], alpha=0.1, linewidth=0)
             span = ", smallest to largest" if is_text or len(groups) <= MOST_BANDS else ""
-            most = max(len(v) for v in inside)
+            sizes = sorted({len(v) for v in inside})
+            most = " to ".join(map(str, dict.fromkeys((sizes[0], sizes[-1]))))
             ax.set_title(f"median{span} of {most} cases", fontsize=figures.SMALL, loc="right")
         if is_text:
             ax.set_xticks(range(len(places)), [str(v) for v in places], rotation=30, ha="right")
     if group is not None:
         figures.legend_beside(ax)
-    if figures.is_wide(value):
+    if figures.is_wide(value[is_there]):
         figures.log_scale(ax, "y")
 
 
@@ -335,17 +351,8 @@ def _points(
                 across[part], value[part], s=size, color=color, linewidths=0, label=str(name)
             )
         ax.plot([], [], " ", label=hue)
-    ax.plot(
-        across[best],
-        value[best],
-        "o",
-        label=f"the {len(best)} best" if len(best) else None,
-        color="black",
-        markerfacecolor="none",
-        markersize=5,
-        markeredgewidth=0.9,
-        zorder=3,
-    )
+    text = f"the {best.sum()} best" if best.any() else None
+    ax.plot(across[best], value[best], "o", label=text, markersize=5, **RING)
     if ax.get_legend_handles_labels()[1]:
         figures.legend_above(figure, ax)
     _scale_ordinate(ax, value)
@@ -359,9 +366,15 @@ def _best_text(data: SweepData, count: int) -> str:
 
 def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
     """Each axis a vertical line, each case a polyline coloured by rank; the best stand out."""
-    names = [name for name in swept_names(data) if data[name].ndim == 1]
+    cases, columns = np.flatnonzero(chosen).tolist(), {}
+    for name in swept_names(data):
+        is_list = data[name].ndim > 1
+        lists = np.array([shown_value(data, name, case) for case in cases if is_list])
+        columns[name] = lists if is_list else _drawn(data, name)[chosen]
+    names = [x for x in columns if data[x].ndim == 1 or len({*columns[x]}) <= MOST_LISTS]
     if not names:
         raise StudyError("--x: needed here, no axis of this sweep is a single number or text")
+    notes = [f"no axis for {x}: too many lists" for x in columns if x not in names]
     value = shown_metric(data, y)[chosen]
     best = np.flatnonzero(np.isin(np.flatnonzero(chosen), recommended(data, y)))
     order = np.argsort(-value)
@@ -370,14 +383,14 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
     with figures.styled():
         figure, ax = figures.one_panel(4.2)
         for k, name in enumerate([*names, y]):
-            column = value if k == len(names) else data[name][chosen]
+            column = value if k == len(names) else columns[name]
             if column.dtype.kind in "UO":
                 ticks, column = np.unique(column.astype(str), return_inverse=True)
                 texts = list(ticks)
                 low, high = 0.0, float(max(len(ticks) - 1, 1))
             else:
-                column = column.astype(float)
-                low, high = float(column.min()), float(column.max())
+                column = np.where(np.isfinite(column.astype(float)), column, np.nan)
+                low, high = float(np.nanmin(column)), float(np.nanmax(column))
                 texts = [f"{v:.3g}" for v in (low, high)]
                 if low > 0 and (high > 30 * low or (k < len(names) and is_log(data, name))):
                     column, low, high = np.log(column), np.log(low), np.log(high)
@@ -395,7 +408,13 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
                     zorder=5,
                 )
         matrix = np.array(lines)
-        for case in order[-3000:]:
+        is_whole = np.isfinite(matrix).all(axis=0)
+        gaps = [x for x, line in zip(names, matrix, strict=False) if np.isnan(line).any()]
+        if gaps:
+            notes.append(f"{np.sum(~is_whole):,} not drawn, without a value of {', '.join(gaps)}")
+        if len(order) > MOST_LINES:
+            notes.append(f"the {len(order) - MOST_LINES:,} largest are not drawn")
+        for case in order[-MOST_LINES:]:
             color = matplotlib.colormaps[MAP](rank[case])
             ax.plot(matrix[:, case], color=color, linewidth=0.5, alpha=0.4)
         for case in best:
@@ -407,7 +426,7 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
             fontsize=figures.SMALL,
             loc="right",
         )
-        _note_left_out(figure, data, chosen)
+        _note_left_out(figure, data, chosen, "; ".join(notes))
     return figure
 
 
@@ -459,16 +478,7 @@ def _placements(data: SweepData, y: str) -> Figure:
                 alpha=0.5,
                 rasterized=True,
             )
-            bottom.plot(
-                centers[chosen, k] * unit,
-                value[chosen],
-                "o",
-                color="black",
-                markersize=4,
-                markerfacecolor="none",
-                markeredgewidth=0.8,
-                zorder=3,
-            )
+            bottom.plot(centers[chosen, k] * unit, value[chosen], "o", markersize=4, **RING)
         _scale_ordinate(bottom, value[is_ok])
         bottom.set_xlabel("centre of the patch pair along the link [mm]")
         bottom.set_ylabel(label(data, y))

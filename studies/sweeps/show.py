@@ -340,11 +340,15 @@ def _number_text(data: SweepData, name: str, record: Record) -> str:
 
 def print_left_out(data: SweepData, console: Console) -> None:
     """Report how many cases are not ok and hence left out."""
-    codes = data["status"]
-    counts = Counter(codes[codes != status.OK].tolist())
-    if counts:
-        reasons = "; ".join(f"{n} {reason(code)}" for code, n in counts.most_common())
-        console.print(f"left out: {reasons}")
+    if (data["status"] != status.OK).any():
+        console.print(f"left out: {left_out_text(data, data['status'] != status.OK)}")
+
+
+def left_out_text(data: SweepData, is_left: np.ndarray) -> str:
+    """Why cases are left out: how many for which reason."""
+    counts = Counter(data["status"][is_left].tolist()).most_common()
+    words = (reason(code) if code != status.OK else "without a value" for code, _ in counts)
+    return "; ".join(f"{n} {why}" for (_, n), why in zip(counts, words, strict=True))
 
 
 def label(data: SweepData, name: str) -> str:
