@@ -28,6 +28,8 @@ UNEVEN = 1e-3
 FEWEST = 4
 #: Share of the sample rate up to which responses are taken if nothing else is said [1].
 HIGHEST = 0.4
+#: Factor in the power of averaged cross spectra from which two clocks are seen [1].
+DRIFTING = 1.5
 #: A record that changes by less is still [its unit].
 SMALLEST = 1e-150
 
@@ -85,6 +87,7 @@ def recorded_response(
     # of size 1, so that their powers are numbers
     unit = np.std(output) / np.std(source)
     source, output = source / np.std(source), output / np.std(output)
+    _check_clocks(source, output, step, size, path)
     whole = _estimate(source, output, step, size, settings)
     half = _estimate(source, output, step, size // 2, settings)
     averages = INDEPENDENT * count if settings.has_window else float(count)
@@ -116,6 +119,40 @@ def recorded_response(
         coherence=coherence,
         averages=averages,
     )
+
+
+def _check_clocks(
+    source: np.ndarray, output: np.ndarray, step: float, size: int, path: str
+) -> None:
+    """Refuse an output that falls further behind its input from segment to segment.
+
+    By d s a segment, cross spectra turn by -2 pi f d: their average is too small, or nothing.
+
+    Raises:
+        StudyError: turned back, the average has `DRIFTING` times the power.
+    """
+    count, window = len(source) // size, signal.get_window("hann", size)
+    spectra = [
+        np.fft.rfft(x[: count * size].reshape(count, size) * window)[:, 1:]
+        for x in (source, output)
+    ]
+    cross, turn = spectra[1] * spectra[0].conj(), 2 * np.pi * np.fft.rfftfreq(size, step)[1:]
+    drift, back, fine = 0.0, cross, 16 * size
+    for apart in (1, count // 2):  # segments between those compared: near ones, then exactly
+        pair = np.sum(back[apart:] * back[:-apart].conj(), axis=0)
+        lag = int(np.argmax(np.fft.irfft(np.append(0, pair), fine)))
+        late = step * size / fine * (lag - fine if lag > fine // 2 else lag)
+        left, weight = np.angle(pair * np.exp(1j * late * turn)), np.abs(pair)
+        late -= float(np.sum(weight * turn * left) / np.sum(weight * turn**2))
+        drift += late / apart
+        back = cross * np.exp(1j * np.outer(np.arange(count), drift * turn))
+    power = [float(np.sum(np.abs(np.sum(x, axis=0)) ** 2)) for x in (cross, back)]
+    if power[1] > DRIFTING * power[0]:
+        raise StudyError(
+            f"{path}: the output falls behind the input by {1e6 * drift / (size * step):.3g} us "
+            "more each second, as if recorded with another clock; record both with one clock, or "
+            f"multiply the output's time by {1 - drift / (size * step):.7g}"
+        )
 
 
 def check_band(band: tuple[float, float], step: float, path: str) -> None:

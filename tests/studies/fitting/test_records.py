@@ -1,7 +1,10 @@
 """Raw time records of a shaken machine, as frequency responses with their noise."""
 
+import re
+
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 from studies.errors import StudyError
 from studies.fitting.measurements import make_bench
@@ -121,6 +124,22 @@ SHORT = RECORD | {"segment_s": 0.5}
 def test_what_is_no_record_is_refused(change, message, short):
     with pytest.raises(StudyError, match=message):
         made(spec_of(short, SHORT | change))
+
+
+@pytest.mark.parametrize("drift", [-1e-4, 5e-4])
+def test_two_clocks_of_different_rate_are_named(drift):
+    """The fit of such a record took the average for a gain that is too small."""
+    time, source, output = recorded(two_modes, 4)
+    late = CubicSpline(time, output)(time * (1 - drift))
+    with pytest.raises(StudyError, match="as if recorded with another clock") as refused:
+        recorded_response(time, source, late, HANN, "data")
+    told = float(re.search("by (\\S+) us more each second", str(refused.value))[1])
+    assert told == pytest.approx(1e6 * drift, rel=0.01)
+    factor = float(re.search("the output's time by (\\S+)$", str(refused.value))[1])
+    mended = CubicSpline(time * factor, late)(time)[100:-200]
+    found = recorded_response(time[100:-200], source[100:-200], mended, HANN, "data")
+    off = np.abs(found.value / two_modes(found.frequency) - 1)
+    assert off[np.abs(found.frequency - 114) < 20].max() < 0.1
 
 
 def test_units_do_not_matter():
