@@ -394,7 +394,7 @@ COMMANDS = {
     "export": ("export", "../../study.toml", "--target", "c", *OUT),
     "fit": ("fit", "../../fit.toml", *OUT),
     "spillover": ("spillover", "../../study.toml", *OUT),
-    "paper": ("paper", "gupta_2010", *OUT),
+    "paper": ("paper", "zhang_2016", *OUT),
     "twin": ("twin", "../../study.toml", *OUT),
     "verify": ("verify", "../../study.toml", "--json"),
 }

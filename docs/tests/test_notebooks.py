@@ -16,7 +16,7 @@ OURS, DEEPER = ("jaxmodel", "studies"), ("jaxmodel.", "studies.")
 
 NOTEBOOKS = {path.stem: path for path in sorted((TOP / "notebooks").glob("*.ipynb"))}
 #: Much to compile; in short: the same functions in test_sweeps, test_tuning, test_atlas,
-#: test_spillover, test_export and test_robust.
+#: test_spillover, test_export, test_robust and test_sampled_loop.
 LONG = (
     "2_coupling",
     "3_placement_sweep",
@@ -25,6 +25,7 @@ LONG = (
     "6_from_design_to_c",
     "7_python_control",
     "9_gauges_or_piezo",
+    "10_placement_criteria",
 )
 #: Packages of an extra that a notebook needs.
 NEEDS = {"7_python_control": ("control", "ctrlsys")}
@@ -33,6 +34,7 @@ QUICK = [name for name in NOTEBOOKS if name not in LONG]
 
 def test_there_are_notebooks():
     assert sorted(NOTEBOOKS) == [
+        "10_placement_criteria",
         "1_first_run",
         "2_coupling",
         "3_placement_sweep",

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from studies.errors import StudyError, field_error, nearest
 from studies.papers.card import PaperCard
-from studies.papers.gupta_2010.card import CARD as GUPTA_2010
 from studies.papers.rrr_2016.card import CARD as RRR_2016
 from studies.papers.zhang_2016.card import CARD as ZHANG_2016
 
-CARDS: dict[str, PaperCard] = {card.name: card for card in (ZHANG_2016, RRR_2016, GUPTA_2010)}
+CARDS: dict[str, PaperCard] = {card.name: card for card in (ZHANG_2016, RRR_2016)}
 #: Papers that a notebook examines.
-NOTEBOOKS = {"geronel_2025": "notebooks/9_gauges_or_piezo.ipynb"}
+NOTEBOOKS = {
+    "geronel_2025": "notebooks/9_gauges_or_piezo.ipynb",
+    "gupta_2010": "notebooks/10_placement_criteria.ipynb",
+}
 
 
 def find_card(name: str) -> PaperCard:

@@ -12,20 +12,8 @@ import pytest
 import scipy
 from rich.console import Console
 
-from jaxmodel.piezo import actuator_constant
 from studies.papers.card import FAILS, HOLDS, depends_on, outcome_of
 from studies.papers.catalogue import CARDS, NOTEBOOKS
-from studies.papers.gupta_2010 import card as gupta_card
-from studies.papers.gupta_2010.closed_loop import MODES, ClosedLoops, close_loops
-from studies.papers.gupta_2010.criteria import (
-    LinkPlaces,
-    controllability,
-    least_effort,
-    least_spillover,
-    modal_force,
-    observability,
-)
-from studies.papers.gupta_2010.findings import PlaceGrid, PlacementFindings, rank
 from studies.papers.rrr_2016 import card as rrr_card
 from studies.papers.rrr_2016 import confirmation, energies, findings, thresholds
 from studies.papers.rrr_2016.claims import judge
@@ -55,8 +43,6 @@ from studies.papers.rrr_2016.report import _falls_below
 from studies.papers.rrr_2016.thresholds import DAMPING, greatest_damping, threshold
 from studies.papers.run import run_card
 from studies.show.document import schema
-from studies.study.cases import build_case
-from studies.study.spec import paper_study
 from tests import TOP
 from tests.pages import text_of
 from tests.studies.test_cli import refused, run
@@ -77,6 +63,7 @@ def test_cards_are_listed(capsys):
         (("rrr",), "NAME = 'rrr'; allowed: .*did you mean 'rrr_2016'?"),
         (("zhang_2016",), "--out: missing"),
         (("geronel_2025", "--out", "OUT"), "no card; see notebooks/9_gauges"),
+        (("gupta_2010",), "no card; see notebooks/10_placement"),
         (("--out", "OUT"), "NAME: missing; allowed: zhang_2016"),
     ],
 )
@@ -368,94 +355,6 @@ def kind_of(study, reduction):
     found = dict.fromkeys(DEFINITIONS, reduction * ones)
     sampled = Sampled(machines=None, row=None, ratio=ones, reduction=found, thresholds={})
     return Kind(study=study, baseline=base, sampled=sampled, strong=None, best=None, confirmed=[])
-
-
-# --- gupta_2010 -----------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def placed():
-    """Loops with a pair at a quarter, a third, the middle and three quarters of the links."""
-    places = np.array([0.05, 0.2 / 3, 0.1, 0.15])
-    return close_loops(paper_study(), places, np.array([0.02, 0.1, 0.2, 20.0]))
-
-
-def test_criteria_of_a_uniform_link_are_those_of_its_sines(placed):
-    """Slopes over a patch of length a: k cos(k (x + a/2)) - k cos(k (x - a/2)), k = j pi/L."""
-    link, place = placed.link, placed.place
-
-    def slopes(mode, length):
-        return np.abs(np.sin(mode * np.pi * place / 0.2) * np.sin(mode * np.pi * length / 0.4))
-
-    force = modal_force(link)
-    np.testing.assert_allclose(force / force[2], slopes(1, 0.03) / slopes(1, 0.03)[2], rtol=1e-6)
-    # mid-span is a node of mode 2, a third one of mode 3
-    for measure in (controllability, observability):
-        found = measure(link)
-        assert found[[1, 2]].max() < 1e-6 * found[0]
-    assert least_effort(link).argmax() == 2
-    # both slopes have a factor k, and frequencies grow as k^2
-    loop = [slopes(j, 0.03) * slopes(j, 0.01) for j in range(1, MODES + 1)]
-    wanted, found = loop[0] / sum(loop[1:]), least_spillover(link)
-    np.testing.assert_allclose(found / found[0], wanted / wanted[0], rtol=1e-6)
-
-
-def test_static_deflection_of_the_host_is_that_of_a_pair_of_moments(placed):
-    """A pair of moments M over a at mid-span bends it by M a (L - a/2)/(4 E I)."""
-    study = paper_study()
-    beam, patches = study.link, study.patches
-    machine = build_case(study).machine
-    moment = float(np.max(actuator_constant(machine.beam, machine.patches)))
-    stiffness = beam.youngs_modulus * beam.width * beam.thickness**3 / 12
-    a, length = patches.actuator_length, beam.length
-    wanted = moment * a * (length - a / 2) / (4 * stiffness)
-    assert abs(placed.link.bending[2]) == pytest.approx(wanted, rel=1e-6)
-
-
-def test_weak_control_damps_as_designed(placed):
-    """Energies fall as 1/zeta: 1.55 N s/m add 0.196, of which the least factor is 0.02."""
-    added = 0.02 * 1.55 / (2 * 0.0055 * placed.link.omega[2, 0])
-    assert placed.energy[2, 0] == pytest.approx(0.01 / (0.01 + added), rel=0.1)
-    assert np.isnan(placed.energy[:, -1]).all()
-
-
-def test_least_residual_keeps_the_margin():
-    """By hand: unstable from factor 4 on, so that 2 may be used and 3 may not."""
-    link = LinkPlaces(*(np.ones((1, 1)),) * 4, np.ones(1))
-    energy = np.array([[0.8, 0.5, 0.3, np.nan]])
-    loops = ClosedLoops(np.ones(1), np.array([1.0, 2.0, 4.0, 5.0]), energy, link)
-    assert loops.residual[0] == pytest.approx(np.sqrt(0.5))
-    never = loops._replace(energy=np.full((1, 4), np.nan))
-    assert never.residual[0] == 1.0
-
-
-def test_loss_and_rank_of_a_criterion():
-    loops = ClosedLoops(
-        place=np.array([0.1, 0.2, 0.3]),
-        factor=np.array([1.0, 2.0]),
-        energy=np.array([[0.36, 0.5], [0.25, 0.5], [0.49, 0.5]]),
-        link=None,
-    )
-    same = rank(np.array([2.0, 3.0, 1.0]), loops)
-    assert (same.place, same.loss, same.correlation) == (0.2, 0.0, pytest.approx(1.0))
-    other = rank(np.array([2.0, 1.0, 3.0]), loops)
-    assert other.loss == pytest.approx(0.7 / 0.5 - 1)
-    assert other.correlation == pytest.approx(-1.0)
-    figure = gupta_card.draw(PlacementFindings(paper_study(), loops, {"same": same}))
-    (removed,) = figure.axes[0].lines  # [%], over the places [mm]
-    np.testing.assert_allclose(removed.get_xdata(), [100.0, 200.0, 300.0])
-    np.testing.assert_allclose(removed.get_ydata(), [40.0, 50.0, 30.0])
-
-
-def test_placement_card_writes_a_whole_folder(tmp_path):
-    small = gupta_card.CARD._replace(
-        run=partial(gupta_card.evaluate, PlaceGrid(places=4, factors=4))
-    )
-    result = run_card(small, tmp_path, Console(quiet=True))
-    images = [*(f"{name}.png" for name in result.figures), "machine.png"]
-    data = [*(f"{name}.csv" for name in result.tables), "claims.json"]
-    assert sorted(x.name for x in tmp_path.iterdir()) == sorted([*data, *images, "report.html"])
-    assert {one.outcome for one in result.verdicts} <= {HOLDS, FAILS}
 
 
 def test_damping_falls_below_a_limit_between_two_mass_ratios():
