@@ -62,7 +62,10 @@ class SweepData:
             return self.cases
         table = build_table(self.spec)
         if len(table) != self.n_cases:
-            raise StudyError(f"{RESULTS}: {self.n_cases} cases; its sweep has {len(table)}")
+            raise StudyError(
+                f"{RESULTS}: {self.n_cases} cases; its sweep has {len(table)}. An older version ran "
+                "equal cases twice: run its sweep anew, in a new folder"
+            )
         return table
 
     @cached_property

@@ -326,7 +326,7 @@ def test_nothing_is_kept_where_no_design_has_the_margin(whole, tmp_path):
     assert (tmp_path / BEST).exists()
     none = screened(tmp_path, margin=60.0)
     assert none.n_kept == 0 and not (tmp_path / BEST).exists()
-    assert "none has a gain margin of at least 60 (largest: " in summary_lines(none)[-2]
+    assert "none has a gain margin of at least 60 (largest: " in summary_lines(none)[-3]
     write_screen_report(tmp_path, none)
     text = text_of((tmp_path / "report.html").read_text())
     assert "None of these is kept: they lack the margin." in text and "Next steps" not in text
