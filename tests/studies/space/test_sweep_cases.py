@@ -250,6 +250,7 @@ def test_ragged_lists_are_padded():
     array = padded([((1.0,), (2.0, 3.0)), ((4.0, 5.0, 6.0), ())], 2)
     assert array.shape == (2, 2, 3)
     assert np.isnan(array[0, 0, 1]) and array[1, 0, 2] == 6 and np.isnan(array[1, 1]).all()
+    np.testing.assert_array_equal(padded([2.0, (3.0, 4.0)], 2), [[2.0, 2.0], [3.0, 4.0]])
 
 
 def test_designs_for_sensitivity():
