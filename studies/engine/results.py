@@ -63,8 +63,8 @@ class SweepData:
         table = build_table(self.spec)
         if len(table) != self.n_cases:
             raise StudyError(
-                f"{RESULTS}: {self.n_cases} cases; its sweep has {len(table)}. An older version ran "
-                "equal cases twice: run its sweep anew, in a new folder"
+                f"{RESULTS}: {self.n_cases} cases; its sweep has {len(table)}. An older version "
+                "ran equal cases twice: run its sweep anew, in a new folder"
             )
         return table
 
