@@ -12,6 +12,7 @@ from studies.engine.columns import PER_CASE
 from studies.engine.results import SweepData, read_sweep, swept_names
 from studies.engine.stored import CODES
 from studies.space.spec import BlockNode
+from studies.space.table import all_columns
 from studies.store import Variable, axis_sizes, variable_labels, with_coordinates
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ def as_dataset(data: SweepData) -> xarray.Dataset:
     """The same of a sweep's data as read."""
     import xarray
 
+    data = _whole_grid(data)
     codes = {name: v for name, v in data.variables.items() if name in CODES}
     variables = data.variables | {f"{name}_text": _words(code) for name, code in codes.items()}
     coordinates = {"case", "case_id", "seed", "repeat", *data.table.columns, *axis_sizes(variables)}
@@ -64,6 +66,22 @@ def as_dataset(data: SweepData) -> xarray.Dataset:
     arrays = {name: (v.dims, v.data, variable_labels(v)) for name, v in variables.items()}
     dataset = xarray.Dataset(arrays, attrs=labels)
     return dataset.set_coords(sorted(coordinates & arrays.keys()))
+
+
+def _whole_grid(data: SweepData) -> SweepData:
+    """With the cases of a grid that repeat others, which were run once."""
+    spec, table = data.spec, data.table
+    if not (table.n_double and _is_grid(spec.root)) or table.n_dropped:
+        return data
+    columns = {x: np.repeat(y, spec.sweep.repeats, 0) for x, y in all_columns(spec).items()}
+    variables = {
+        name: v._replace(data=v.data[table.origin]) if v.dims[:1] == ("case",) else v
+        for name, v in data.variables.items()
+    }
+    for name, column in columns.items():
+        if name in variables and column.dtype != object:
+            variables[name] = variables[name]._replace(data=column)
+    return SweepData(variables, data.attributes, spec, table)
 
 
 def _words(code: Variable) -> Variable:

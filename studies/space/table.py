@@ -198,6 +198,12 @@ def build_table(spec: SweepSpec, rows: np.ndarray | None = None, has_ids: bool =
     return table.rows(single, np.searchsorted(single, first[which]))
 
 
+def all_columns(spec: SweepSpec) -> Columns:
+    """Columns of every row of a sweep's design, without `where` and with those that repeat."""
+    design = design_of(spec.root, spec.study, spec.sweep.seed)
+    return _with_subsets(design.rows(np.arange(design.size)))
+
+
 def _with_subsets(columns: Columns) -> Columns:
     """With names of the links that are controlled, where lists of switches vary."""
     if "control.links" not in columns or "link_subsets" in columns:

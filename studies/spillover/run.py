@@ -79,7 +79,7 @@ def spillover_design(
     names = (PHASES[0], "prove", *PHASES[1:]) if has_proofs else PHASES
     with Phases(console, names) as phases:
         phases.begin("judge", "the controller on plants that differ from its nominal model")
-        certificate = certify(study, margin, bases)
+        certificate = certify(study, margin, bases=bases)
         if has_proofs:
             phases.begin("prove", "every number of modes, and a box of machines")
             certificate = certificate._replace(proofs=prove(fixed_controller(study)))

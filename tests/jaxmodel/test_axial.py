@@ -157,7 +157,7 @@ def test_lumped_inertia_of_heavy_links_is_estimated_and_reported():
     estimate = float(words.split("about ")[1].split(" %")[0]) / 100
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", "link.basis = .* leaves out the patches")
+        warnings.filterwarnings("ignore", "link.basis = .* leaves out the patches|link.density = ")
         check_run(HEAVY_LINKS.change(link__axial_inertia="distributed"))
         check_run(HEAVY_LINKS.change(link__shortening=False))
     # undamped: phases drift apart

@@ -449,7 +449,7 @@ def test_an_unstable_loop_is_said_loudly_and_beside_no_control(capsys, tmp_path)
     (tmp_path / "loud.toml").write_text(changed(control={"gain_factor": 20.0}))
     out = tmp_path / "run.h5"
     code, text, _ = run(capsys, "simulate", tmp_path / "loud.toml", "--out", out, "--report")
-    assert code == 0 and "UNSTABLE LOOP" in text
+    assert code == 1 and "UNSTABLE LOOP" in text
     report = text_of((tmp_path / "run.html").read_text())
     assert "**UNSTABLE LOOP" in report
     # the column beside is what the same study leaves without control

@@ -2,7 +2,6 @@
 
 import json
 import re
-from functools import partial
 from types import SimpleNamespace
 from unittest import mock
 
@@ -432,7 +431,7 @@ def few(move):
     with mock.patch.multiple(
         spillover_run,
         smallest_change=lambda design, units: CHANGE._replace(tolerances=units),
-        certify=partial(certify, **plants),
+        certify=lambda study, margin, bases: certify(study, margin, **plants),
         run_fast_move=lambda study: move,
     ):
         yield
