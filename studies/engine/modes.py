@@ -13,7 +13,7 @@ from jaxmodel.linear import linearise, mass_and_stiffness, natural_modes, restin
 from jaxmodel.prepare import prepare
 from studies.engine.preflight import check_pose
 from studies.engine.programs import kept_jit
-from studies.engine.simplifications import warn_of_patches
+from studies.engine.simplifications import warn_of_patches, warn_of_sizes
 from studies.publish import shown
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study, parse_study
@@ -136,6 +136,7 @@ def machine_modes(study: Study | None = None, **changes: Any) -> NamedModes:
         StudyError: value out of range, pose out of reach or singular.
     """
     study = modes_study(study, **changes)
+    warn_of_sizes(study)
     warn_of_patches(study)
     structure, case = build_structure(study), as_arrays(build_case(study))
     where = study.motion.waypoints[0]

@@ -165,6 +165,7 @@ def check_machine(study: Study) -> tuple[Structure, Case]:
 
 def _checked(study: Study, is_run: bool) -> tuple[Structure, Case]:
     config.require_configured()
+    warn_of_sizes(study)  # a wrong unit may be what is refused below
     check_locked(study)
     structure, case = build_structure(study), as_arrays(build_case(study))
     prepared = preflight(structure, case)
@@ -200,7 +201,6 @@ def _checked(study: Study, is_run: bool) -> tuple[Structure, Case]:
     _check_rates(study, structure, prepared)
     if structure.feedback == "ideal":
         structure = structure._replace(substeps=_ideal_substeps(study, structure, case))
-    warn_of_sizes(study)
     warn_of_patches(study)
     warn_of_lumping(study, float(prepared.lumping))
     warn_of_mismatch(study, prepared.plant_omega, prepared.believed_omega)

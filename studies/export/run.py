@@ -11,6 +11,7 @@ from rich.console import Console
 from studies import config
 from studies.engine.controller import FixedController, check_codable, fixed_controller
 from studies.engine.design import Design
+from studies.engine.preflight import check_run
 from studies.errors import StudyError, field_error, nearest
 from studies.export.compiler import NO_COMPILER, find_compiler
 from studies.export.document import study_hash
@@ -96,6 +97,8 @@ def export_design(
 
     check_codable(design.study)
     exported = fixed_controller(design.study)
+    if is_verified:  # by the study's own motion
+        check_run(exported.study)
     job = Job(
         exported=exported,
         name=name,
