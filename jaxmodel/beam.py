@@ -26,6 +26,7 @@ from jaxmodel.static import (
     Pieces,
     bent_at,
     link_pieces,
+    section_mass,
     section_stiffness,
     static_bending,
     static_loads,
@@ -97,16 +98,20 @@ def build_basis(
         raise ValueError(f"basis = {kind!r}; allowed: {', '.join(BASES)}")
     if n_modes < 1:
         raise ValueError(f"n_modes = {n_modes}; allowed: 1 or more [1]")
-    centers = jnp.asarray(patches.center)
-    n_links = len(centers)
-    stations = jnp.asarray(stations)
-    stations = jnp.broadcast_to(stations, (n_links, stations.shape[-1]))
-    own = _each_link(patches._replace(center=0.0), n_links)._replace(center=centers)
 
     def one_link(beam_i: Beam, patches_i: Patches, stations_i: Array) -> ModalBasis:
         return BASES[kind].modes(beam_i, patches_i, n_modes, stations_i)
 
-    return mask_modes(jax.vmap(one_link)(_each_link(beam, n_links), own, stations), mode_mask)
+    return mask_modes(jax.vmap(one_link)(*_by_link(beam, patches, stations)), mode_mask)
+
+
+def _by_link(beam: Beam, patches: Patches, stations: Array) -> tuple[Beam, Patches, Array]:
+    """Data of the links with a leading axis, one value per link."""
+    centers, stations = jnp.asarray(patches.center), jnp.asarray(stations)
+    n_links = len(centers)
+    own = _each_link(patches._replace(center=0.0), n_links)._replace(center=centers)
+    stations = jnp.broadcast_to(stations, (n_links, stations.shape[-1]))
+    return _each_link(beam, n_links), own, stations
 
 
 def _each_link(parts: _Parts, n_links: int) -> _Parts:
@@ -147,10 +152,8 @@ def left_out_of_loads(
     Returns:
         As `static_loads` of each link, less the share of the modes, (3, 2 K + S, S + 2).
     """
-    n_links = len(basis.mass)
-    own = _each_link(patches._replace(center=0.0), n_links)._replace(center=patches.center)
     loads = partial(static_loads, has_patches=BASES[kind].has_patches)
-    exact = jax.vmap(loads)(_each_link(beam, n_links), own, stations)
+    exact = jax.vmap(loads)(*_by_link(beam, patches, stations))
     slopes = [jnp.swapaxes(x, 1, 2) for x in (basis.sensor_slope, basis.actuator_slope)]
     seen = jnp.concatenate([slopes[0], basis.deflection_at, slopes[1]], axis=1)
     forces = [jnp.swapaxes(basis.deflection_at, 1, 2), basis.b[..., None], basis.c[..., None]]
@@ -340,9 +343,7 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
     length = beam.length
     pieces = link_pieces(beam, patches)
     bends = _bends(pieces, length)
-    line_mass = beam.density * beam.width * beam.thickness
-    patch_mass = patches.density * patches.width * patches.thickness
-    covers = jnp.sum(pieces.has_ceramic + pieces.has_actuator, axis=0)
+    line_mass = section_mass(beam, patches, pieces, has_patches=True)
 
     def shapes(xi: Array) -> _Shapes:
         smooth, bent = _smooth_shapes(xi, n_sines)[0], _bent_shapes(xi, bends)
@@ -354,7 +355,7 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
     width = (bends.pieces.right - bends.pieces.left)[:, None]
     xi = (bends.pieces.left[:, None] + width * node).ravel()
     weight = length * (width * weight).ravel()
-    mass_w = weight * jnp.repeat(line_mass + patch_mass * covers, node.size)
+    mass_w = weight * jnp.repeat(line_mass, node.size)
     stiffness = section_stiffness(beam, patches, pieces, has_patches=True)
     stiffness_w = weight * jnp.repeat(stiffness, node.size)
 
@@ -392,7 +393,7 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
     # mass and first moment of what lies beyond a point, piece by piece
     left, right = pieces.left[:, None], pieces.right[:, None]
     rest = jnp.clip(xi * length, left, right)
-    line = (line_mass + patch_mass * covers)[:, None]
+    line = line_mass[:, None]
     beyond = (
         jnp.sum(line * (right - rest), axis=0),
         jnp.sum(line * (right**2 - rest**2) / 2, axis=0),

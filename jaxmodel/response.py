@@ -84,7 +84,7 @@ def bench_plant(structure: Structure, case: Case, pose: Array) -> BenchPlant:
     return BenchPlant(
         state=plant.state,
         actuator=jnp.stack([plant.voltage, wrench @ left_out.actuator_wrench]),
-        slider_force=jnp.stack([plant.force, 0.0 * plant.force]),
+        slider_force=jnp.stack([plant.force, jnp.zeros_like(plant.force)]),
         hammer=jnp.stack([hammer, wrench @ left_out.hammer_wrench]),
         sensor=plant.sensor + moved[: len(to_sensor)],
         deflection=deflection,

@@ -135,6 +135,18 @@ def dense(system: StateSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
     return a, enter, leave, direct
 
 
+def used_states(a: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Which states of x_(k+1) = A x + .., u = C x + .. anything depends on, (n,).
+
+    A delay line longer than the delay has commands that nothing reads, and states that only these
+    read.
+    """
+    used: np.ndarray = np.ones(len(a), bool)
+    while np.any(idle := used & ~(np.any(a[used], axis=0) | np.any(c, axis=0))):
+        used = used & ~idle
+    return used
+
+
 class ModalForm(NamedTuple):
     """A system in real modal form: blocks of two states, a pair of poles or two real ones."""
 

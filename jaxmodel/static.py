@@ -79,6 +79,21 @@ def section_stiffness(beam: Beam, patches: Patches, pieces: Pieces, has_patches:
     return stiffness * beam.stiffness_factor
 
 
+def section_mass(beam: Beam, patches: Patches, pieces: Pieces, has_patches: bool) -> Array:
+    """Mass per length rhoA of each piece [kg/m], (n,).
+
+    Args:
+        beam, patches: one link's data.
+        pieces: of that link.
+        has_patches: patches load the link (static).
+    """
+    line_mass = beam.density * beam.width * beam.thickness
+    if not has_patches:
+        return line_mass * jnp.ones_like(pieces.left)
+    patch_mass = patches.density * patches.width * patches.thickness
+    return line_mass + patch_mass * jnp.sum(pieces.has_ceramic + pieces.has_actuator, axis=0)
+
+
 def bent_at(pieces: Pieces, length: Array, x: Array) -> Array:
     """Deflection from the chord under unit curvature of one piece [m/(1/m)], (len(x), n).
 
@@ -138,10 +153,7 @@ def static_loads(beam: Beam, patches: Patches, stations: Array, has_patches: boo
     s = left + width * (node + 1) / 2  # (n, 3)
     stiffness = section_stiffness(beam, patches, pieces, has_patches)
     softness = width * weight / 2 / stiffness[:, None]
-    line_mass = beam.density * beam.width * beam.thickness * jnp.ones_like(pieces.left)
-    if has_patches:
-        ceramic = patches.density * patches.width * patches.thickness
-        line_mass += ceramic * jnp.sum(pieces.has_ceramic + pieces.has_actuator, axis=0)
+    line_mass = section_mass(beam, patches, pieces, has_patches)
 
     def heaped(s: Array) -> Array:
         """int rhoA <s - x> dx and int rhoA x <s - x> dx, (2, len(s))."""

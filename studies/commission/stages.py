@@ -109,9 +109,7 @@ def price_text(out: Path, tuned: Study) -> str:
 
 def _certify(measured: MeasuredSpec, out: Path, console: Console) -> None:
     design, margin = tuned_design(out), certified_margin(measured)
-    bases = (
-        design.study.link.basis,
-    )  # with which the data were explained; others have other gains
+    bases = (design.study.link.basis,)  # other loop gains would not have explained the data
     spillover_design(design, out / "certificate", margin, console, bases=bases)
 
 
@@ -132,12 +130,7 @@ CERTIFIED = f"certificate/{CERTIFICATE}"
 STAGES = (
     Stage("fit", "fit the model to the measurements", (f"fit/{DOCUMENT}",), _fit),
     Stage("tune", "tune on machines that the data leave possible", (DESIGN,), _tune),
-    Stage(
-        "certificate",
-        "certify on plants that differ from the model",
-        (CERTIFIED,),
-        _certify,
-    ),
+    Stage("certificate", "certify on plants that differ from the model", (CERTIFIED,), _certify),
     Stage(
         "firmware",
         "export, compare, emulate",

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from jaxmodel.controller import Controller
-from jaxmodel.state_space import IllConditionedError, StateSpace, dense, modal_form
+from jaxmodel.state_space import IllConditionedError, StateSpace, dense, modal_form, used_states
 
 #: What pairs of states may change of a command over the largest, a third of what exports allow [1],
 #: and over how many samples both are compared.
@@ -89,15 +89,14 @@ def _observed(one: StateSpace) -> StateSpace:
     """One group as one block, without states that nothing depends on, as older commands."""
     a, b, c, d = dense(one)
     tell = None if one.anti_windup is None else one.anti_windup.reshape(b.shape)
-    used = np.any(a, axis=0) | np.any(c, axis=0)
-    kept = StateSpace(
+    used = used_states(a, c)
+    return StateSpace(
         state=a[None, None][..., used, :][..., used],
         enter=b[None, None, used],
         leave=c[None, :, None, used],
         direct=d[None],
         anti_windup=None if tell is None else tell[None, None, used],
     )
-    return kept if used.all() else _observed(kept)
 
 
 def _to_pairs(one: StateSpace) -> StateSpace | None:

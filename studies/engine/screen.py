@@ -95,14 +95,29 @@ def screen_arrays(spec: SweepSpec, table: CaseTable, done: Done) -> dict[str, np
         done: a chunk of the linear model.
     """
     assert spec.screen is not None
-    arrays = chunk_arrays(table, done, [spec.screen.metric])
-    variables = {name: labelled(name, data) for name, data in arrays.items()}
-    value = metric_values(SweepData(variables, {}, spec, table), spec.screen.entry)
+    code, value = chunk_values(spec, table, done, spec.screen.entry)
     return {
         "case_id": table.case_id[done.chunk.rows],
-        "screen_status": arrays["status"],
-        "screen_value": np.asarray(value, float),
+        "screen_status": code,
+        "screen_value": value,
     }
+
+
+def chunk_values(
+    spec: SweepSpec, table: CaseTable, done: Done, entry: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Status of the cases of a chunk, and what they are ranked by, (n,) each.
+
+    Args:
+        spec: the sweep.
+        table: all cases.
+        done: the chunk.
+        entry: a metric, or an entry of it.
+    """
+    arrays = chunk_arrays(table, done, [entry.partition("[")[0]])
+    variables = {name: labelled(name, data) for name, data in arrays.items()}
+    value = metric_values(SweepData(variables, {}, spec, table), entry)
+    return arrays["status"], np.asarray(value, float)
 
 
 def ranked(table: CaseTable, screened: Finished, screen: Screen) -> np.ndarray:

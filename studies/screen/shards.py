@@ -11,11 +11,11 @@ import numpy as np
 from rich.console import Console
 
 from studies.engine.chunks import Done, LocalRunner
-from studies.engine.columns import labelled
 from studies.engine.plan import local_layout, most_lanes, plan_groups
 from studies.engine.progress import Phases, Reporter
-from studies.engine.results import SweepData, counted_links, direction, metric_values
-from studies.engine.stored import accurate, chunk_arrays, inaccurate
+from studies.engine.results import SweepData, counted_links, direction
+from studies.engine.screen import chunk_values
+from studies.engine.stored import accurate, inaccurate
 from studies.errors import StudyError, field_error
 from studies.screen.tally import Axes, Tally, divided, merged, nothing, tally_of
 from studies.space.designs import LazyCases, design_of
@@ -237,10 +237,7 @@ def shard_tally(
 
 
 def _chunk_tally(screen: ScreenRequest, table: CaseTable, done: Done) -> Tally:
-    part, arrays = table.rows(done.chunk.rows), chunk_arrays(table, done, [screen.metric])
-    variables = {name: labelled(name, data) for name, data in arrays.items()}
-    value = metric_values(SweepData(variables, {}, screen.spec, part), screen.entry)
+    part = table.rows(done.chunk.rows)
+    code, value = chunk_values(screen.spec, table, done, screen.entry)
     columns = axis_columns(part)
-    return tally_of(
-        part.row, arrays["status"], np.asarray(value, float), columns, screen.axes, *screen.ranking
-    )
+    return tally_of(part.row, code, value, columns, screen.axes, *screen.ranking)

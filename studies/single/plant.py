@@ -15,6 +15,7 @@ from jaxmodel.laws import LAWS
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import SampledPlant, sampled_plant
+from jaxmodel.state_space import used_states
 from studies.engine.preflight import check_machine
 from studies.engine.programs import kept_jit
 from studies.engine.runs import resolved_study
@@ -69,7 +70,8 @@ def plant_of(study: Study) -> NamedSystem:
     structure, case = check_machine(study)
     pose = np.array(study.motion.waypoints[0], float)
     found = jax.tree.map(np.asarray, _plant(structure._replace(n_steps=1, substeps=1), case, pose))
-    a, b, c = _observed(found)
+    used = used_states(found.state, found.leave)  # without commands older than the delay
+    a, b, c = found.state[np.ix_(used, used)], found.enter[used], found.leave[:, used]
     actuators, sensors = _ports(structure)
     return NamedSystem(
         a=a,
@@ -80,15 +82,6 @@ def plant_of(study: Study) -> NamedSystem:
         inputs=actuators,
         outputs=sensors,
     )
-
-
-def _observed(plant: SampledPlant) -> SampledPlant:
-    """Without states that nothing depends on: commands older than the delay."""
-    a, b, c = plant
-    used = np.any(a, axis=0) | np.any(c, axis=0)
-    if used.all():
-        return plant
-    return _observed(SampledPlant(a[np.ix_(used, used)], b[used], c[:, used]))
 
 
 @kept_jit(static_argnums=0)

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from jaxmodel import status
 from studies.engine.columns import NOT_RUN
+from studies.engine.fidelity import rank_correlation
 from studies.engine.results import SweepData, direction, meets, metric_values
 from studies.engine.screen import audited, in_order
 from studies.errors import StudyError
@@ -120,12 +121,10 @@ def _random(data: SweepData, order: np.ndarray) -> np.ndarray:
 
 
 def _rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Spearman's, equal values with equal ranks; NaN for fewer than three different values."""
-    from scipy.stats import rankdata  # takes a third of a second
-
+    """NaN for fewer than three different values."""
     if min(len(np.unique(x)) for x in (a, b)) < 3:
         return float("nan")
-    return float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])
+    return rank_correlation(a, b)
 
 
 def draw_screen(data: SweepData) -> Figure:

@@ -12,6 +12,7 @@ from markupsafe import Markup
 from jaxmodel import status
 from jaxmodel.loop_figures import MARGINS, PEAKS
 from jaxmodel.metrics import METRICS
+from studies.engine.fidelity import rank_correlation
 from studies.engine.poles import HEADER, difference, pole_rows
 from studies.publish import shown
 from studies.show.pages import page
@@ -491,12 +492,6 @@ def _fidelity(spec: TuneSpec, findings: TuneFindings) -> dict[str, Any] | None:
         "spread": spread,
         "rank": rank_correlation(a, b),
     }
-
-
-def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Spearman's coefficient [1]."""
-    rank = [np.argsort(np.argsort(x)).astype(float) for x in (a, b)]
-    return float(np.corrcoef(rank[0], rank[1])[0, 1])
 
 
 def _codes(judged: JudgedDesign) -> str:

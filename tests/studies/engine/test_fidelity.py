@@ -31,8 +31,8 @@ def test_ranks_are_compared_by_what_comes_first(monkeypatch, by, sign):
     spec = parse_sweep(GAINS)
     rising = np.arange(12.0)
 
-    def values(spec, table, metric, entry, is_linear):
-        assert (metric, entry) == ("residual_rms", "residual_rms")
+    def values(spec, table, rows, entry, is_linear):
+        assert entry == "residual_rms" and rows.tolist() == list(range(12))
         return rising[::-1] ** 2 if is_linear else np.where(rising == 4, np.nan, rising)
 
     monkeypatch.setattr(fidelity, "_values", values)
