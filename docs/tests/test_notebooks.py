@@ -26,6 +26,7 @@ LONG = (
     "7_python_control",
     "9_gauges_or_piezo",
     "10_placement_criteria",
+    "11_are_links_coupled",
 )
 #: Packages of an extra that a notebook needs.
 NEEDS = {"7_python_control": ("control", "ctrlsys")}
@@ -35,6 +36,7 @@ QUICK = [name for name in NOTEBOOKS if name not in LONG]
 def test_there_are_notebooks():
     assert sorted(NOTEBOOKS) == [
         "10_placement_criteria",
+        "11_are_links_coupled",
         "1_first_run",
         "2_coupling",
         "3_placement_sweep",

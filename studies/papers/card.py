@@ -29,7 +29,7 @@ class Claim(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """Outcome of a claim: `HOLDS`, `FAILS`, or what it depends on (`depends_on`)."""
+    """Outcome of a claim: `HOLDS` or `FAILS`."""
 
     claim: Claim
     outcome: str
@@ -44,16 +44,6 @@ class Verdict(NamedTuple):
 def outcome_of(is_met: bool) -> str:
     """`HOLDS` or `FAILS`."""
     return HOLDS if is_met else FAILS
-
-
-def depends_on(quantity: str, condition: str) -> str:
-    """Outcome of a claim that is true for some machines only.
-
-    Args:
-        quantity: that decides.
-        condition: where the claim holds, with numbers: "holds below 0.3, fails above 0.7".
-    """
-    return f"depends on {quantity}: {condition}"
 
 
 class CardResult(NamedTuple):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from studies.errors import StudyError, field_error, nearest
 from studies.papers.card import PaperCard
-from studies.papers.rrr_2016.card import CARD as RRR_2016
 from studies.papers.zhang_2016.card import CARD as ZHANG_2016
 
-CARDS: dict[str, PaperCard] = {card.name: card for card in (ZHANG_2016, RRR_2016)}
+CARDS: dict[str, PaperCard] = {card.name: card for card in (ZHANG_2016,)}
 #: Papers that a notebook examines.
 NOTEBOOKS = {
     "geronel_2025": "notebooks/9_gauges_or_piezo.ipynb",
     "gupta_2010": "notebooks/10_placement_criteria.ipynb",
+    "rrr_2016": "notebooks/11_are_links_coupled.ipynb",
 }
 
 
@@ -24,6 +24,7 @@ def find_card(name: str) -> PaperCard:
     if name in NOTEBOOKS:
         raise StudyError(f"NAME = {name!r}: no card; see {NOTEBOOKS[name]}")
     if name not in CARDS:
-        begun = next((card for card in CARDS if name and card.startswith(name.lower())), "")
-        raise field_error("NAME", name, ", ".join(CARDS), hint=begun or nearest(name, CARDS))
+        papers = [*CARDS, *NOTEBOOKS]
+        begun = next((paper for paper in papers if name and paper.startswith(name.lower())), "")
+        raise field_error("NAME", name, ", ".join(CARDS), hint=begun or nearest(name, papers))
     return CARDS[name]
