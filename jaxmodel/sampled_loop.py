@@ -20,6 +20,7 @@ from jaxmodel.drive import Reference, drive_step
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import DriveState, resting_drive
 from jaxmodel.electronics import FASTEST
+from jaxmodel.exponential import exponential
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.linear import LinearPlant, Moment, linearise, resting
 from jaxmodel.loop import Loop
@@ -328,7 +329,6 @@ class AnaloguePlant(NamedTuple):
     enters: Array  # B of commands and drive forces, (n, 3 K + 3)
     filtered: slice  # of the state: what the converters see
     voltage: slice | None  # of the state: on the actuators; None: the command itself
-    size: Array  # typical size of each entry of the state, (n,)
 
 
 class _Sampled(NamedTuple):
@@ -384,10 +384,7 @@ def _held_transition(analogue: AnaloguePlant, period: Array) -> Array:
     n, n_inputs = analogue.enters.shape
     held = jnp.zeros((n + n_inputs,) * 2, analogue.state.dtype)
     held = held.at[:n, :n].set(analogue.state).at[:n, n:].set(analogue.enters)
-    # balance velocities against positions, or scaling costs the exponential digits
-    scale = jnp.concatenate([analogue.size, jnp.full((n_inputs,), 1e6)])
-    exact = jax.scipy.linalg.expm(held / scale[:, None] * scale * period)
-    return (exact * scale[:, None] / scale)[:n]
+    return exponential(held, period)[:n]
 
 
 def analogue_plant(structure: Structure, plant: LinearPlant, case: Case) -> AnaloguePlant:
@@ -397,17 +394,12 @@ def analogue_plant(structure: Structure, plant: LinearPlant, case: Case) -> Anal
     are summed, and there are fewer sensors than modes.
     """
     electronics, n_plant = case.electronics, plant.state.shape[0]
-    n_sensors, n_modes = (
-        structure.n_sensors,
-        structure.n_links * structure.n_modes,
-    )
-    n_pose = structure.n_pose
-    sizes = [(1.0, n_pose), (1e3, n_pose), (1.0, n_modes), (1e3, n_modes)]
-    blocks = {"z": 1e4, "z_rate": 1e7}
+    n_sensors = structure.n_sensors
+    blocks = ["z", "z_rate"]
     if structure.has_sensor_highpass:
-        blocks["s"] = 1e4
+        blocks.append("s")
     if structure.has_amplifier:
-        blocks["voltage"] = 1e6
+        blocks.append("voltage")
     begins = n_plant + n_sensors * np.arange(len(blocks) + 1)
     at = {name: slice(*ends) for name, *ends in zip(blocks, begins, begins[1:], strict=False)}
     n, eye, corner = begins[-1], jnp.eye(n_sensors), electronics.antialias
@@ -439,14 +431,11 @@ def analogue_plant(structure: Structure, plant: LinearPlant, case: Case) -> Anal
         if "s" in at:
             commands = commands.at[at["s"]].set(highpass * plant.direct_sensor)
     forces = jnp.pad(plant.force, ((0, n - n_plant), (0, 0)))
-    sizes += [(size, n_sensors) for size in blocks.values()]
-    size = jnp.asarray(np.concatenate([np.full(count, x) for x, count in sizes]), state.dtype)
     return AnaloguePlant(
         state=state,
         enters=jnp.concatenate([commands, forces], axis=1),
         filtered=at["z"],
         voltage=at.get("voltage"),
-        size=size,
     )
 
 

@@ -29,6 +29,7 @@ OVERLOADED = 21
 OVERDAMPED = 22
 UNPLACEABLE = 23
 DELAY_OFF = 24
+UNJUDGED = 25
 
 #: A case with one of these statuses ran to its end, and its metrics are valid.
 FINISHED = (
@@ -40,6 +41,7 @@ FINISHED = (
     NOT_ARRIVED,
     NEAR_SINGULAR,
     OVERLOADED,
+    UNJUDGED,
 )
 
 REASONS = {
@@ -70,4 +72,5 @@ REASONS = {
     UNPLACEABLE: "poles that cannot be placed: no decay, one beyond the mode's frequency without "
     "a frequency given, beyond half the sample rate, or estimates in phase",
     DELAY_OFF: "delay of the commands beyond 0 to 4 samples",
+    UNJUDGED: "no verdict on stability: the linearised sampled loop is not finite",
 }

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from jaxmodel.case import Case, Electronics, Structure
 from jaxmodel.delay import LONGEST, CommandChange, command_change
+from jaxmodel.exponential import exponential
 from jaxmodel.laws.contract import NominalModel, system_feedback
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
@@ -178,14 +179,13 @@ def _moves(
     period, eye = electronics.period, jnp.eye(n_patches)
     inputs = slice(n, n + n_patches)
     if not structure.has_delay:
-        whole = jax.scipy.linalg.expm(between * period)[:n]
+        whole = exponential(between, period)[:n]
         state = jnp.pad(whole[:, : n + n_patches], ((0, n_patches), (0, 0)))
         enter = jnp.concatenate([jnp.zeros((n, n_patches), whole.dtype), eye])
         return _Moves(whole, state, enter, state)
     change = command_change(electronics.delay)
     first, second = (
-        jax.scipy.linalg.expm(between * share * period)[:n]
-        for share in (change.share, 1 - change.share)
+        exponential(between, share * period)[:n] for share in (change.share, 1 - change.share)
     )
     free = second[:, :n] @ first
     newest, last, *older = (

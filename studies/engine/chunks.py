@@ -40,6 +40,7 @@ class JudgedChunk(NamedTuple):
 
     result: Result
     margins: LoopFigures
+    has_verdict: bool  # on sampled loops: their margins are numbers, or could not be found
 
 
 class Started(NamedTuple):
@@ -212,7 +213,8 @@ def start_chunk(
     running = executor.start(cases)
     if is_first:
         executor.compile_time += spent
-    return Started(lambda: JudgedChunk(running.wait(), margins), running.cancel)
+    has_verdict = is_judged and executor.structure.feedback == "sampled"
+    return Started(lambda: JudgedChunk(running.wait(), margins, has_verdict), running.cancel)
 
 
 def judge_cases(structure: Structure, cases: Case, robustness: tuple[str, ...] = ()) -> LoopFigures:

@@ -33,7 +33,7 @@ class Run(NamedTuple):
     structure: Structure
     case: Case
     result: Result  # NumPy arrays
-    status: int  # code of `jaxmodel.status`; UNSTABLE comes from the linearised loop
+    status: int  # code of `jaxmodel.status`; UNSTABLE and UNJUDGED come from the linearised loop
     loop: LoopFigures | None = None  # of its linearised sampled loop, if that is judged
     motion: LoopFigures | None = None  # with the forces of the motion, (k,)
     poles: PoleReport | None = None  # specified and obtained, where gains follow from poles
@@ -71,7 +71,7 @@ def run_study(
         if has_margins:
             loop = loop._replace(robustness=_margins(structure, case, loop))
     except np.linalg.LinAlgError:  # a non-finite entry
-        return run._replace(status=run.status or status.NON_FINITE)
+        return run._replace(status=judged_status(run.status, None))
     code = judged_status(run.status, loop)
     return run._replace(status=code, loop=loop, motion=motion, poles=poles)
 
@@ -132,6 +132,8 @@ def run_uncontrolled(study: Study, is_linear: bool = False) -> Run:
     return _run(study, structure._replace(is_linear=is_linear), case, False)
 
 
-def judged_status(code: int, loop: LoopFigures) -> int:
-    """Status of a run: UNSTABLE if its loop is and nothing else stopped it."""
-    return status.UNSTABLE if code in status.FINISHED and not loop.is_stable else code
+def judged_status(code: int, loop: LoopFigures | None) -> int:
+    """Status of a run whose loop was judged, None: without success, if nothing else stopped it."""
+    if code not in status.FINISHED or (loop is not None and loop.is_stable):
+        return code
+    return status.UNJUDGED if loop is None else status.UNSTABLE

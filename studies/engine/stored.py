@@ -94,8 +94,9 @@ def chunk_arrays(table: CaseTable, done: Done, kept: list[str]) -> dict[str, np.
     margins |= {name: data[:count] for name, data in (loops.robustness or {}).items()}
     code = np.asarray(result.status)[:count].copy()
     code[done.chunk.is_too_stiff] = status.TOO_STIFF
-    code[np.isin(code, status.FINISHED) & (margins["gain_margin"] < 1)] = status.UNSTABLE
-    is_finished = np.isin(code, status.FINISHED)
+    is_finished, margin = np.isin(code, status.FINISHED), margins["gain_margin"]
+    code[is_finished & (margin < 1)] = status.UNSTABLE
+    code[is_finished & np.isnan(margin) & done.judged.has_verdict] = status.UNJUDGED
     modes, controlled = (table.values(name)[rows] for name in ("link.modes", "control.modes"))
     arrays: dict[str, np.ndarray] = {}
     judged = {"status": code, "substeps": np.full(count, done.substeps), **margins}
@@ -208,6 +209,8 @@ def joined_columns(
             inside = slice(*np.searchsorted(at, (rows.start, rows.stop)))
             if inside.start < inside.stop:
                 with h5py.File(path, "r") as store:
+                    if name not in store:  # of a sweep that an older version has extended
+                        continue
                     data = store[name][()]
                 into = (at[inside] - rows.start, *map(slice, data.shape[1:]))
                 part[into] = data[row[inside]]

@@ -200,3 +200,26 @@ def test_a_load_is_refused_for_the_link_that_it_compresses_most():
     ):
         _check_load(short_study(), prepared)
     _check_load(short_study(), SimpleNamespace(steady_load=0.6 * share))
+
+
+def test_a_loop_of_thick_patches_is_judged():
+    """Sensors of 40 V/um: the exponential of plant and filters was NaN, and with it the verdict."""
+    study = short_study(
+        **SMALL | FAST, patches__thickness=0.005, electronics__conditioner_gain=0.0005
+    )
+    run = run_study(study, has_record=False)
+    assert run.status == status.OK
+    assert run.loop.gain_margin > 1
+
+
+def test_a_loop_without_a_verdict_is_never_ok(monkeypatch):
+    """Whatever else the run was: an unstable loop would pass."""
+
+    def fail(*_):
+        raise np.linalg.LinAlgError("Array must not contain infs or NaNs")
+
+    monkeypatch.setattr("studies.engine.runs.run_report", fail)
+    run = run_study(short_study(**SMALL | FAST), has_record=False)
+    assert run.status == status.UNJUDGED
+    assert run.loop is None
+    assert "no verdict on stability" in status.REASONS[run.status]

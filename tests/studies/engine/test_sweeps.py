@@ -21,7 +21,7 @@ from rich.console import Console
 
 import studies
 from jaxmodel import status
-from studies.engine import function, plan
+from studies.engine import chunks, function, plan
 from studies.engine import sweep as run_module
 from studies.engine.design import deviation, load_design
 from studies.engine.folder import (
@@ -32,6 +32,7 @@ from studies.engine.folder import (
     open_folder,
 )
 from studies.engine.function import TRACES
+from studies.engine.margins import no_margins
 from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import run_study
 from studies.engine.sweep import make_plan, run_sweep
@@ -102,6 +103,16 @@ def test_mode_counts_subsets_and_placements_share_one_compilation(mixed):
     assert np.isnan(rms[data["link.modes"] == 2][:, :, 2]).all()  # a mode that does not exist
     assert np.isfinite(rms[data["link.modes"] == 3]).all()
     assert len(np.unique(data["residual_rms"][:, 0, 0])) > 40
+
+
+def test_cases_without_a_verdict_are_not_ok(tmp_path):
+    """As in a single run: their metrics hold, but no ranking takes them."""
+    unjudged = mock.patch.object(chunks, "judge_loops", no_margins)
+    with unjudged:
+        run(noisy_spec({"axes": {"gain": [0.5, 1.0]}}), tmp_path / "a")
+    data = read_sweep(tmp_path / "a")
+    assert set(data["status"]) == {status.UNJUDGED}
+    assert np.isfinite(data["residual_rms"]).all()
 
 
 def test_every_case_equals_its_replay(mixed):
