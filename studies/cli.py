@@ -9,6 +9,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any
@@ -47,7 +48,9 @@ app = typer.Typer(
 )
 #: Width of tables in redirected output; a terminal uses its own width.
 FILE_WIDTH = 240
-is_watched = sys.stdout.isatty() or "COLUMNS" in os.environ
+if not os.environ.get("COLUMNS", "1").strip("0"):
+    del os.environ["COLUMNS"]  # a width of 0 would hide all that is printed
+is_watched = (sys.stdout is not None and sys.stdout.isatty()) or "COLUMNS" in os.environ
 
 
 class SafeConsole(Console):
@@ -69,17 +72,24 @@ INTERRUPTED = 130
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `studies` command."""
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115
+    os.environ["MPLBACKEND"] = "agg"  # figures go to files; one for windows may be missing here
     keep_programs()
     if threading.current_thread() is threading.main_thread():  # what batch systems end jobs with
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     if isinstance(sys.stdout, TextIOWrapper):  # what its encoding lacks is shown as an escape
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
+        if sys.stdout is None:
+            raise StudyError("standard output: closed; send it to a file or to /dev/null")
         _check_text(sys.argv[1:] if arguments is None else arguments)
-        with warnings.catch_warnings():
+        output: Any = _Output(sys.stdout)
+        with warnings.catch_warnings(), redirect_stdout(output):
             warnings.showwarning = _show_each_once()
             if app(args=arguments, standalone_mode=False) == INTERRUPTED:
                 raise KeyboardInterrupt
+            output.flush()
     except (StudyError, TyperException) as error:
         text = error.format_message() if isinstance(error, TyperException) else str(error)
         if text:  # empty if help was printed because no command was given
@@ -99,6 +109,33 @@ def main(arguments: list[str] | None = None) -> None:
             raise
         print(f"studies: {printable(reason)}", file=sys.stderr)
         sys.exit(2)
+
+
+class _Output:
+    """Standard output whose faults, such as a full disk, are errors with one message."""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+    def write(self, text: str) -> int:
+        return int(self._checked(self._file.write, text))
+
+    def flush(self) -> None:
+        self._checked(self._file.flush)
+
+    def _checked(self, call: Callable[..., Any], *arguments: str) -> Any:
+        try:
+            return call(*arguments)
+        except OSError as error:
+            # what is left would fail again when Python ends
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self._file.fileno())
+            if isinstance(error, BrokenPipeError):  # the reader, such as `head`, has enough
+                sys.exit(1)
+            reason = f"standard output: cannot be written to ({error.strerror})"
+            raise StudyError(reason) from None
 
 
 def _is_compiling() -> bool:
