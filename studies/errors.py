@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 
 #: Longer values are shortened to this [characters].
@@ -102,6 +102,23 @@ def _text(value: object, depth: int = LONGEST) -> str:
 
 def nearest(name: str, names: Iterable[str]) -> str:
     """The entry of `names` most like `name`, ignoring case, or "" if none is close."""
-    by_lower = {candidate.lower(): candidate for candidate in names}
-    close = get_close_matches(name.lower(), by_lower, n=1)
-    return by_lower[close[0]] if close else ""
+    return _closest(name.lower(), {candidate.lower(): candidate for candidate in names})
+
+
+def nearest_field(name: str, fields: Iterable[str]) -> str:
+    """The one of `fields`, such as `drive.kp`, most like `name`, or "" if none is close.
+
+    A guess is mostly wrong in one part: so its own section first, then the last part in any.
+    """
+    section, _, leaf = name.lower().rpartition(".")
+    whole = {field.lower(): field for field in fields}
+    parts = [(*lower.rpartition("."), field) for lower, field in reversed(whole.items())]
+    own = {last: field for where, _, last, field in parts if where == section}
+    anywhere = {last: field for _, _, last, field in parts}  # the first section that has it
+    close = _closest(leaf, own) or _closest(leaf, anywhere)
+    return close if close or own else _closest(name.lower(), whole)
+
+
+def _closest(wanted: str, found: Mapping[str, str]) -> str:
+    close = get_close_matches(wanted, found, n=1)
+    return found[close[0]] if close else ""

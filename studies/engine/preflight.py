@@ -269,11 +269,20 @@ def _check_duration(study: Study, structure: Structure, prepared: Preflight) -> 
     # free vibration of a platform at rest: the window can end with the run
     is_free = len(study.motion.waypoints) == 1 and left > period / 2
     longest = np.inf if is_free else left
+    if longest < period * (1 - 1e-9):  # no residual_length would do
+        raise field_error(
+            "run.duration",
+            study.run.duration,
+            f"{_round_up(needed):g} or more: nothing is left for the residual window after the "
+            f"shaped motion of {end:.4g} s and {_wait_text(study, delay)}; metrics.residual_length "
+            f"= {study.metrics.residual_length:g}",
+            "s",
+        )
     if not period * (1 - 1e-9) <= study.metrics.residual_length <= longest + 1e-9:
         raise field_error(
             "metrics.residual_length",
             study.metrics.residual_length,
-            f"{period:g} to {max(left, 0):.6g}, from one sample to what run.duration = "
+            f"{period:g} to {left:.6g}, from one sample to what run.duration = "
             f"{duration:g} leaves after the shaped motion of {end:.4g} s and "
             f"{_wait_text(study, delay)}; run.duration = {_round_up(needed):g} would do",
             "s",

@@ -72,11 +72,18 @@ def recorded_response(
     last = float(time[-1] - time[0])
     hop = size // 2 if settings.has_window else size
     count = (len(time) - size) // hop + 1 if len(time) >= size else 0
+    longest = last / _in_all(settings)
+    if longest < 16 * step:  # no segment would do
+        least = 16 * step * _in_all(settings)
+        raise StudyError(
+            f"{path}: a record of {last:.4g} s; allowed: {least:.4g} s or more, {FEWEST} segments "
+            f"of 16 samples ({16 * step:.3g} s)"
+        )
     if size < 16 or count < FEWEST:
         raise field_error(
             f"{path}.segment_s",
             settings.segment,
-            f"{16 * step:.3g} to {_longest(last, settings):.3g}: {FEWEST} segments or more of this "
+            f"{16 * step:.3g} to {longest:.3g}: {FEWEST} segments or more of this "
             f"record of {last:.4g} s",
             "s",
         )
@@ -169,9 +176,9 @@ def check_band(band: tuple[float, float], step: float, path: str) -> None:
         raise field_error(f"{path}.from_hz", low, f"below {high or HIGHEST / step:.6g}", "Hz")
 
 
-def _longest(duration: float, settings: RecordSettings) -> float:
-    """Longest segment of which there are `FEWEST` [s]."""
-    return duration * (2 / (FEWEST + 1) if settings.has_window else 1 / FEWEST)
+def _in_all(settings: RecordSettings) -> float:
+    """Length of `FEWEST` segments over that of one [1]."""
+    return (FEWEST + 1) / 2 if settings.has_window else FEWEST
 
 
 def even_step(time: np.ndarray, path: str) -> float:

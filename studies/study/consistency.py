@@ -230,6 +230,14 @@ def _check_patches(study: Study) -> None:
             raise field_error(
                 f"patches.{name}_length", pitch, f"at most link.length = {length:g}{of_link}", "m"
             )
+        most = int(length / pitch * (1 + 1e-9))
+        if len(row) > most:  # no places would do
+            raise field_error(
+                "patches.centers",
+                row.tolist(),
+                f"{most} at most, so that patches {pitch:g} m long do not overlap on a link "
+                f"{length:g} m long{of_link}",
+            )
         ordered, centers = np.sort(row), [float(f"{x:.9g}") for x in row]
         if ordered[0] < pitch / 2 - 1e-12 or ordered[-1] > length - pitch / 2 + 1e-12:
             raise field_error(

@@ -9,7 +9,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from studies.errors import StudyError, field_error, nearest, shown, shown_name
+from studies.errors import StudyError, field_error, nearest, nearest_field, shown, shown_name
 from studies.study.choices import OneOf
 from studies.study.sizes import OneEach, depth
 
@@ -182,16 +182,23 @@ def _unknown(
     name = str(location[-1])
     prefix = "".join(f"{part}." for part in [inside, *location[:-1]] if part != "")
     field = prefix + name
-    close = nearest(name, model.model_fields)
-    hint = f"did you mean {prefix + close!r}?" if close else ""
-    for section, info in study.model_fields.items() if not close else ():
-        if name in getattr(info.annotation, "model_fields", ()):
-            hint = f"did you mean {f'{section}.{name}'!r}?"
+    own = nearest(name, model.model_fields)
+    close = prefix + own if own else nearest_field(field, _fields(study, inside))
+    hint = f"did you mean {close!r}?" if close else ""
     where = f"in [{prefix.rstrip('.')}]" if prefix else "at the top"
     if not prefix and name in COMMANDS:
         hint = f"`studies {name}` reads that; a study alone has none"
     hint = hint or f"allowed: {where}: {', '.join(model.model_fields)}"
     return StudyError(f"{shown_name(field)} = {shown(value)}: unknown field; {hint}")
+
+
+def _fields(study: type[BaseModel], inside: str) -> list[str]:
+    """Names of all fields of its sections, as in a file."""
+    return [
+        f"{inside}.{section}.{leaf}".lstrip(".")
+        for section, info in study.model_fields.items()
+        for leaf in getattr(info.annotation, "model_fields", ())
+    ]
 
 
 def _bad_value(

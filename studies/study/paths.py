@@ -20,7 +20,7 @@ from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.mechanisms.contract import Mechanism
 from jaxmodel.mechanisms.prrr import PRRR
 from jaxmodel.table import Parameter
-from studies.errors import StudyError, field_error, nearest, shown
+from studies.errors import StudyError, field_error, nearest_field, shown
 from studies.study.consistency import check_consistency, check_mechanism, check_own_fields
 from studies.study.explain import choices_of, unit_of
 from studies.study.sizes import alternatives, depth, has_one_a_link
@@ -199,7 +199,7 @@ def known_field(name: str, study: Study, path: str = "", others: Iterable[str] =
     where = f"{path}: " if path else ""
     if entry is None or entry.field not in names:
         field = entry.field if entry else name
-        close = nearest(field, [*names, *others]) or _by_leaf(field, names)
+        close = nearest_field(field, [*names, *others])
         hint = f"did you mean {close!r}?" if close else "see studies init --all for all fields"
         raise StudyError(f"{where}{shown(name)}: unknown field; {hint}")
     value = field_value(study, entry.field)
@@ -213,11 +213,6 @@ def known_field(name: str, study: Study, path: str = "", others: Iterable[str] =
             )
         value = value[index]
     return value
-
-
-def _by_leaf(field: str, names: list[str]) -> str:
-    leaf = field.rsplit(".", 1)[-1]
-    return next((name for name in names if name.endswith(f".{leaf}")), "")
 
 
 def set_value(study: Study, name: str, value: Any) -> dict[str, Any]:

@@ -32,6 +32,8 @@ STARTERS = (
     "shaper.kind",
     "control.velocity_gain",
     "control.damping",
+    "electronics.sample_rate_hz",
+    "electronics.voltage_limit",
     "drive.kp",
     "drive.kd",
     "load.mass",

@@ -366,6 +366,11 @@ def ideal(gain):
             "run.duration = 0.05 leaves",
         ),
         (
+            changed(metrics={"residual_delay": 0.03}),
+            "run.duration = 0.05; allowed: 0.08 or more: nothing is left for the residual window "
+            "after the shaped motion of 0.03 s and metrics.residual_delay = 0.03; metrics.residual_",
+        ),
+        (
             changed(control=ideal(1e6)),
             "control.gain_factor = 1.0; allowed: gains low enough for 200 plant steps per sample",
         ),
@@ -380,6 +385,10 @@ def ideal(gain):
             "link.modes = 3; allowed: modes up to 1.592e+05 Hz at electronics.sample_rate_hz",
         ),
         ("[patches]\ncenters = [0.05, 0.06, 0.15]", "so that no patches overlap [m]"),
+        (
+            "[patches]\ncenters = [0.02, 0.04, 0.06, 0.1, 0.12, 0.14, 0.16]",
+            "0.16]; allowed: 6 at most, so that patches 0.03 m long do not overlap on a link 0.2 m",
+        ),
         ("[control]\nmodes = 4", "control.modes = 4; allowed: 1 to 3, the number of patch pairs"),
         ("[run]\nduration = ", "not valid TOML"),
     ],

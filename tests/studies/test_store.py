@@ -11,7 +11,7 @@ import pytest
 import xarray
 
 from studies import store
-from studies.errors import StudyError, field_error, nearest
+from studies.errors import StudyError, field_error, nearest, nearest_field
 from studies.store import LazyArray, Variable, check_target, read_store, write_store
 
 VARIABLES = {
@@ -226,6 +226,22 @@ def test_field_error_names_value_range_unit_and_nearest():
     )
     assert str(field_error("method", "", "rk4")) == "method = ''; allowed: rk4"
     assert nearest("zzz", ["modal_filter"]) == ""
+
+
+@pytest.mark.parametrize(
+    "guess, field",
+    [
+        ("control.sample_rate", "electronics.sample_rate_hz"),  # like control.ratio_source as whole
+        ("control.gainfactor", "control.gain_factor"),  # of its own section
+        ("kp", "drive.kp"),
+        ("contol.gain_factor", "control.gain_factor"),
+        ("ELECTRONICS.conditionr_gain", "electronics.conditioner_gain"),
+        ("zzzz.zzzz", ""),
+    ],
+)
+def test_nearest_field_of_a_guess_that_is_wrong_in_one_part(guess, field):
+    names = ["control.ratio_source", "control.gain_factor", "electronics.conditioner_gain"]
+    assert nearest_field(guess, [*names, "electronics.sample_rate_hz", "drive.kp"]) == field
 
 
 def test_a_name_that_no_file_can_have_is_refused(tmp_path):

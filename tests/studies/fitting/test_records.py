@@ -126,6 +126,20 @@ def test_what_is_no_record_is_refused(change, message, short):
         made(spec_of(short, SHORT | change))
 
 
+@pytest.mark.parametrize(
+    "settings, least",
+    [
+        (HANN, "0.02 s or more, 4 segments of 16 samples"),
+        (HANN._replace(has_window=False), "0.032"),
+    ],
+)
+def test_a_record_in_which_no_segment_fits_is_too_short(settings, least):
+    """Not "segment_s; allowed: 0.008 to 0.004"."""
+    time, source, output = (x[:20] for x in recorded(two_modes, 0, length=2**14))
+    with pytest.raises(StudyError, match=rf"data: a record of 0.00\d+ s; allowed: {least}"):
+        recorded_response(time, source, output, settings, "data")
+
+
 @pytest.mark.parametrize("drift", [-1e-4, 5e-4])
 def test_two_clocks_of_different_rate_are_named(drift):
     """The fit of such a record took the average for a gain that is too small."""

@@ -19,6 +19,9 @@ REFUSED = [
     ("[contol]\nmodes = 2", "contol = {'modes': 2}: unknown field; did you mean 'control'?"),
     ("[control]\ngain_facter = 1", "gain_facter = 1: unknown field; did you mean 'control.gain_fa"),
     ("gain_factor = 1", "gain_factor = 1: unknown field; did you mean 'control.gain_factor'?"),
+    ("[control]\nsample_rate = 1", "unknown field; did you mean 'electronics.sample_rate_hz'?"),
+    ("sample_rate = 1", "unknown field; did you mean 'electronics.sample_rate_hz'?"),
+    ("[link]\nplatform_mas = 1", "unknown field; did you mean 'machine.platform_mass'?"),
     (
         "[drive]\nzzzz = 1",
         "drive.zzzz = 1: unknown field; allowed: in [drive]: kind, kinds, kp, kd, force",
@@ -223,7 +226,8 @@ def test_the_file_to_start_from_has_few_fields_each_with_its_unit():
     data, lines = tomllib.loads(text), text.splitlines()
     sections = {k: v for k, v in data.items() if k != "title"}
     assert ["title", *(f"{k}.{x}" for k, v in sections.items() for x in v)] == list(STARTERS)
-    assert 20 <= sum(bool(line) for line in lines) <= 32
+    assert data["electronics"].keys() == {"sample_rate_hz", "voltage_limit"}
+    assert 20 <= sum(bool(line) for line in lines) <= 35
     for name in STARTERS:
         k, line = next(
             (k, x) for k, x in enumerate(lines) if x.startswith(f"{name.split('.')[-1]} =")
