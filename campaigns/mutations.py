@@ -29,6 +29,7 @@ from studies.engine.controller import fixed_controller
 from studies.engine.design import load_design
 from studies.engine.folder import (
     BASELINE,
+    CONTENT,
     FIT,
     MANIFEST,
     RESULTS,
@@ -39,6 +40,7 @@ from studies.engine.folder import (
 from studies.engine.folder import finished_cases as finished
 from studies.engine.results import DIGEST, baseline_digest, baseline_id, read_sweep
 from studies.engine.stored import manifest_attributes, merge
+from studies.engine.sweep import case_content
 from studies.errors import StudyError
 from studies.explorer.page import explorer_page
 from studies.export.document import (
@@ -194,7 +196,7 @@ def sweep_folder(folder):
     """A finished sweep with made-up numbers, and an unfinished one."""
     data = small({"axes": {"gain": [0.1, 0.5, 1.0], "controlled_modes": [1, 2]}})
     table, rng = build_table(parse_sweep(data)), np.random.default_rng(0)
-    manifest = make_manifest(data)
+    manifest = make_manifest(data) | {CONTENT: case_content(parse_sweep(data), table)}
     for name, count in (("whole", 6), ("part", 4)):
         chunk = {"case_id": table.case_id[:count]}
         for metric in (*PER_CASE, *METRICS):

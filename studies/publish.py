@@ -11,6 +11,7 @@ import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -66,12 +67,53 @@ def check_target(path: str | Path) -> None:
         raise StudyError(f"{path}: cannot write there, the file is write-protected")
 
 
+#: Locks of the folders that are reserved here: their paths and open files.
+_RESERVED: ContextVar[tuple[tuple[Path, int], ...]] = ContextVar("reserved", default=())
+
+
+@contextmanager
+def reserving(lock: Path, descriptor: int) -> Iterator[None]:
+    """Meanwhile, what is written into the folder of a lock is written only if it is still there."""
+    token = _RESERVED.set((*_RESERVED.get(), (lock, descriptor)))
+    try:
+        check_reserved(lock)
+        yield
+    except (OSError, StudyError):
+        check_reserved(lock)  # the reason why files are missing
+        raise
+    finally:
+        _RESERVED.reset(token)
+
+
+def check_reserved(path: str | Path) -> None:
+    """Raise StudyError if a reserved folder that `path` is in was renamed or removed.
+
+    A lock is held on a file and all else goes by name: under it there may be somebody else's work.
+    """
+    for lock, descriptor in _RESERVED.get():
+        is_inside = Path(os.path.abspath(path)).is_relative_to(os.path.abspath(lock.parent))
+        if is_inside and not is_open_as(lock, descriptor):
+            raise StudyError(
+                f"--out {lock.parent}: was renamed or removed while work went on in it; what is "
+                "finished is where it went, and nothing more is written under the old name"
+            )
+
+
+def is_open_as(path: Path, descriptor: int) -> bool:
+    """Whether the file at a path is the open one."""
+    try:
+        return os.path.samestat(os.stat(path), os.fstat(descriptor))
+    except OSError:
+        return False
+
+
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path that becomes `path` on success, and is removed on any failure.
 
     Those that killed processes left are removed. Write errors are raised as StudyError.
     """
+    check_reserved(path)
     check_target(path)
     target = Path(os.path.realpath(path))
     start = f".{target.name}."
@@ -84,6 +126,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
         yield temporary
         with open(temporary, "rb+") as file:
             os.fsync(file.fileno())
+        check_reserved(path)  # the content may have taken long
         os.replace(temporary, target)
     except OSError as error:
         raise StudyError(f"{path}: cannot write it ({error.strerror or error})") from error
@@ -107,6 +150,7 @@ def publish(out: str | Path, stale: Iterable[str] = ()) -> Iterator[Path]:
         StudyError: the folder cannot be written to, or a file cannot be moved there.
     """
     out = Path(out)
+    check_reserved(out)
     is_new = not out.exists()
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -115,6 +159,7 @@ def publish(out: str | Path, stale: Iterable[str] = ()) -> Iterator[Path]:
                 shutil.rmtree(left, ignore_errors=True)
         with tempfile.TemporaryDirectory(dir=out, prefix=f"{_STAGED}{os.getpid()}-") as folder:
             yield Path(folder)
+            check_reserved(out)
             names = sorted(os.listdir(folder), key=_place)
             for name in names:
                 check_target(out / name)

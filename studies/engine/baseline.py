@@ -42,7 +42,8 @@ def keep_baseline(
     Raises:
         StudyError: the file cannot be written.
     """
-    if not controlled(table).any() or _is_stored(folder, spec):
+    is_sampled = bool((table.values("control.feedback") == "sampled").any())
+    if not controlled(table).any() or _is_stored(folder, spec, is_sampled):
         return
     say("running the baseline without control")
     try:
@@ -51,7 +52,7 @@ def keep_baseline(
         say(f"the baseline cannot run without control: {error}")
         return
     variables = {"status": Variable(np.array(run.status), (), *STATUS_LABEL)}
-    if (table.values("control.feedback") == "sampled").any():
+    if is_sampled:
         step = frame_of(run.structure, run.case).adc_step
         text = "one ADC step, in the deflection of mode 1"
         variables["adc_step"] = Variable(step, ("link",), "m", text)
@@ -64,8 +65,9 @@ def keep_baseline(
     write_store(folder / BASELINE, variables, attributes)
 
 
-def _is_stored(folder: Path, spec: SweepSpec) -> bool:
+def _is_stored(folder: Path, spec: SweepSpec, is_sampled: bool) -> bool:
     try:
-        return bool(read_baseline(folder, spec))
+        stored = read_baseline(folder, spec)
+        return bool(stored) and ("adc_step" in stored) == is_sampled
     except StudyError:  # damaged
         return False

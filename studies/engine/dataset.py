@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from studies.engine.columns import PER_CASE
-from studies.engine.results import SweepData, read_sweep, swept_names
+from studies.engine.results import SweepData, as_sweep, swept_names
 from studies.engine.stored import CODES
 from studies.space.spec import BlockNode
 from studies.space.table import all_columns
@@ -34,12 +35,13 @@ def load(path: str | Path) -> xarray.Dataset:
 
     Returns:
         Metrics, `status` as a code and `status_text` in words, with units and long names as
-        attributes. Cases that have not run have status -1 and NaN.
+        attributes. Cases that have not run have status -1 and NaN. What the folder has of another
+        sweep, or damaged, is left out with a warning, also kept as the attribute `notes`.
 
     Raises:
         StudyError: no sweep there, a damaged file, or results of another version.
     """
-    return as_dataset(read_sweep(path))
+    return as_dataset(as_sweep(path))
 
 
 def as_dataset(data: SweepData) -> xarray.Dataset:
@@ -63,6 +65,7 @@ def as_dataset(data: SweepData) -> xarray.Dataset:
                     variables[name] = _along_own_axes(name, variables[name], len(shape))
         variables = with_coordinates(variables)
     labels = {name: value for name, value in data.attributes.items() if name != "coordinates"}
+    labels |= {"notes": " ".join(data.notes)} if data.notes else {}
     arrays = {name: (v.dims, v.data, variable_labels(v)) for name, v in variables.items()}
     dataset = xarray.Dataset(arrays, attrs=labels)
     return dataset.set_coords(sorted(coordinates & arrays.keys()))
@@ -81,7 +84,7 @@ def _whole_grid(data: SweepData) -> SweepData:
     for name, column in columns.items():
         if name in variables and column.dtype != object:
             variables[name] = variables[name]._replace(data=column)
-    return SweepData(variables, data.attributes, spec, table)
+    return replace(data, variables=variables, cases=table)
 
 
 def _words(code: Variable) -> Variable:

@@ -14,9 +14,9 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from hashlib import file_digest
+from hashlib import file_digest, sha256
 from io import BytesIO
 from pathlib import Path
 from shlex import quote
@@ -29,7 +29,7 @@ from jaxmodel.metrics import METRICS
 from studies import config, sources
 from studies.engine.columns import PER_CASE, SCREENED, label_of
 from studies.errors import StudyError
-from studies.publish import TEMPORARY, replacing
+from studies.publish import TEMPORARY, check_reserved, is_open_as, replacing, reserving
 from studies.reading import open_hdf5, open_regular, read_json
 
 RESULTS, MANIFEST, CHUNKS, LOCK = "results.h5", "sweep.json", "chunks", ".lock"
@@ -37,6 +37,8 @@ RESULTS, MANIFEST, CHUNKS, LOCK = "results.h5", "sweep.json", "chunks", ".lock"
 SCREEN = "screen"
 #: Key in the manifest that lists chunks that were given up.
 GIVEN_UP = "given_up"
+#: And what its cases hold.
+CONTENT = "content"
 #: The corresponding file in a tuning's folder.
 TUNING = "tune.json"
 #: That of a fit.
@@ -47,6 +49,8 @@ BASELINE = "baseline.h5"
 FORMAT = 2
 #: Temporary name of the results.
 JOINED = ".joined.h5"
+#: To read a folder beside what replaces files in it.
+ATTEMPTS = 100
 _CHUNK = re.compile(r"(\d{6,})-([0-9a-f]{16})\.h5")
 _SOURCES = Path(__file__).parents[2]
 
@@ -80,6 +84,7 @@ class Finished(NamedTuple):
     file: np.ndarray  # position in `files`, (n,)
     row: np.ndarray  # in that file, (n,)
     files: list[Path]
+    damaged: Sequence[Path] = ()  # chunks that cannot be read
 
 
 class SweepFolder:
@@ -103,27 +108,43 @@ class SweepFolder:
             StudyError: the disk is full or not writable; nothing half-written remains.
         """
         folder = self.path / place
-        temporary = folder / "unfinished.tmp"
+        check_reserved(folder)
         image = BytesIO()  # HDF5 itself can crash on a full disk
         with h5py.File(image, "w") as file:
             for name, array in arrays.items():
                 file[name] = array
         try:
             folder.mkdir(exist_ok=True)
-            with open(temporary, "wb") as file:
-                file.write(image.getbuffer())
-                file.flush()
-                os.fsync(file.fileno())
             number = 1 + max((n for n, _ in _chunk_files(folder)), default=-1)
-            os.replace(temporary, folder / f"{number:06d}-{file_hash(temporary)}.h5")
+            digest = sha256(image.getbuffer()).hexdigest()[:16]
+            with replacing(folder / f"{number:06d}-{digest}.h5") as temporary:
+                temporary.write_bytes(image.getbuffer())
             _sync(folder)
         except OSError as error:
             raise StudyError(f"{folder}: cannot write a chunk ({error})") from error
-        finally:
-            temporary.unlink(missing_ok=True)
 
-    def begin(self, manifest: dict[str, Any]) -> None:
-        """From now on the folder holds this sweep, or the previous one extended to it."""
+    def begin(
+        self,
+        manifest: dict[str, Any],
+        damaged: Iterable[Path] = (),
+        report: Callable[[str], object] = print,
+    ) -> None:
+        """From now on the folder holds this sweep, or the previous one extended to it.
+
+        Args:
+            manifest: from `make_manifest`, and more.
+            damaged: chunks to set aside.
+            report: called with a message for each of them.
+        """
+        check_reserved(self.path)
+        unfinished = (x for place in (CHUNKS, SCREEN) for x in self.path.glob(f"{place}/*.tmp"))
+        for left in (*self.path.iterdir(), *unfinished):
+            is_own = left.parent != self.path or SWEEPS.leftover.fullmatch(left.name)
+            if is_own and left.is_file():
+                left.unlink()
+        for chunk in damaged:
+            report(f"{chunk.name} is damaged; its cases run again")
+            chunk.rename(chunk.with_suffix(".damaged"))
         old = read_manifest(self.path) if (self.path / MANIFEST).is_file() else {}
         self._write_manifest({**manifest, "results": old.get("results", [])})
 
@@ -147,8 +168,10 @@ class SweepFolder:
             old = [file_hash(self.results)] if self.results.is_file() else []
             manifest["results"] = [*old, file_hash(joined)]
             self._write_manifest(manifest)
+            check_reserved(joined)
             os.replace(joined, self.results)
             _sync(self.path)
+            check_reserved(self.path)
             for place in (CHUNKS, SCREEN):
                 _remove_chunks(self.path / place)
         except OSError as error:
@@ -170,24 +193,20 @@ def _remove_chunks(folder: Path) -> None:
 
 @contextmanager
 def open_folder(path: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterator[SweepFolder]:
-    """Open a sweep's folder, creating it if necessary, and lock it.
+    """Open a sweep's folder, creating it if necessary, and lock it; `begin` is the first to write.
 
     Args:
         path: the folder.
-        manifest: from `make_manifest`.
+        manifest: from `make_manifest`, and more.
         is_resumed: continue the existing sweep.
 
     Raises:
         StudyError: not writable, in use, holds something else, or a different sweep.
     """
     with locked_folder(path, "sweep"):
-        folder = SweepFolder(path)
-        _check_content(folder, manifest, is_resumed)
-        unfinished = (x for place in (CHUNKS, SCREEN) for x in path.glob(f"{place}/*.tmp"))
-        for left in (*path.iterdir(), *unfinished):
-            if left.is_file() and (left.parent != path or SWEEPS.leftover.fullmatch(left.name)):
-                left.unlink()
-        yield folder
+        refuse_existing(path, SWEEPS, is_resumed)
+        check_resumed(path, manifest)
+        yield SweepFolder(path)
 
 
 def _at_once(path: str, flags: int) -> int:
@@ -199,7 +218,8 @@ def _at_once(path: str, flags: int) -> int:
 def locked_folder(path: Path, what: str) -> Iterator[None]:
     """Reserve a folder for this process, creating it if necessary.
 
-    What is refused leaves no trace: the lock and folders made here go again if a StudyError ends
+    It stays reserved only as long as it has its name, see `check_reserved`. What is refused leaves
+    no trace: the lock and folders made here go again if a StudyError ends
     it before anything else is in them.
 
     Args:
@@ -229,9 +249,11 @@ def locked_folder(path: Path, what: str) -> Iterator[None]:
                 "a folder on another file system"
             ) from None
         try:
-            yield
+            with reserving(path / LOCK, lock.fileno()):
+                yield
         except StudyError:
-            if path.is_dir() and set(path.iterdir()) - before == {path / LOCK}:
+            is_here = is_open_as(path / LOCK, lock.fileno())
+            if is_here and set(path.iterdir()) - before == {path / LOCK}:
                 (path / LOCK).unlink()
                 with suppress(OSError):  # somebody else has used one meanwhile
                     for folder in created:
@@ -313,9 +335,9 @@ def read_manifest(path: Path) -> dict[str, Any]:
         spec = manifest.get("spec") if isinstance(manifest, dict) else None
         if not isinstance(spec, dict) or not isinstance(spec.get("sweep"), dict):
             raise ValueError("no sweep in it")
-        for name in ("results", GIVEN_UP):
-            if not isinstance(manifest.get(name, []), list):
-                raise ValueError(f"{name} is not a list")
+        for name, kind in (("results", list), (GIVEN_UP, list), (CONTENT, dict)):
+            if not isinstance(manifest.get(name, kind()), kind):
+                raise ValueError(f"{name} is not a {kind.__name__}")
         if not isinstance(spec["sweep"].get("screen", {}), dict):
             raise ValueError("sweep.screen is not a table")
     except OSError:
@@ -376,27 +398,19 @@ def _refuse_others(path: Path, leftover: re.Pattern[str]) -> None:
         )
 
 
-def _check_content(folder: SweepFolder, manifest: dict[str, Any], is_resumed: bool) -> None:
-    """Reject a folder of something else, an existing sweep, other code, other precision."""
-    refuse_existing(folder.path, SWEEPS, is_resumed)
-    if not (folder.path / MANIFEST).exists():
+def check_resumed(path: Path, manifest: dict[str, Any]) -> None:
+    """Reject a resumed sweep whose cases would not fit the finished ones, before a byte is written.
+
+    Args:
+        path: the folder, which need not hold a sweep yet.
+        manifest: from `make_manifest`; with `content`, what its cases hold is compared, too.
+
+    Raises:
+        StudyError: other code, other precision, another content of a case.
+    """
+    if not (path / MANIFEST).exists():
         return
-    old = read_manifest(folder.path)
-    before, now = (
-        {
-            "metrics": sweep.get("metrics", []),
-            "fidelity": sweep.get("fidelity", "full"),
-            "links": sweep.get("links", []),
-            "screen.by": sweep.get("screen", {}).get("by"),
-        }
-        for sweep in (old["spec"]["sweep"], manifest["spec"]["sweep"])
-    )
-    for name, value in before.items():
-        if value != now[name] and value is not None:
-            raise StudyError(
-                f"--resume: {folder.path} has sweep.{name} = {value!r}, now {now[name]!r}; a "
-                "resumed sweep keeps the same"
-            )
+    old = read_manifest(path)
     for key, what in (
         ("code", "code"),
         ("precision", "precision"),
@@ -404,30 +418,63 @@ def _check_content(folder: SweepFolder, manifest: dict[str, Any], is_resumed: bo
     ):
         if old.get(key) != manifest[key]:
             raise StudyError(
-                f"--resume: {folder.path} was begun with another {what} ({old.get(key)}, now "
+                f"--resume: {path} was begun with another {what} ({old.get(key)}, now "
                 f"{manifest[key]}), so its cases would not fit new ones; name a new folder"
+            )
+    content = manifest.get(CONTENT, old.get(CONTENT, {}))
+    for name, value in old.get(CONTENT, {}).items():
+        if content.get(name) != value:
+            raise StudyError(
+                f"--resume: {path} has sweep.{name} = {value!r}, now {content.get(name)!r}; a "
+                "resumed sweep keeps the same, since finished cases hold nothing else; name a new "
+                "folder"
             )
 
 
-def finished_cases(
-    path: Path, report: Callable[[str], object] | None = None, place: str = CHUNKS
-) -> Finished:
-    """Finished cases, each once; damaged chunks are set aside and reported.
+def steady(path: Path, read: Callable[[], Any]) -> Any:
+    """What is read from a sweep's folder while nothing in it is replaced or removed.
+
+    A sweep that ends beside it joins its chunks: what one listing has named is gone then.
+    """
+    for _ in range(ATTEMPTS):
+        before = _files(path)
+        try:
+            found = read()
+        except (OSError, StudyError):
+            if before <= _files(path):
+                raise
+        else:
+            if before <= _files(path):
+                return found
+    return read()
+
+
+def _files(path: Path) -> set[tuple[str, int, int]]:
+    """What a sweep's folder holds: names, and what tells a file from one that replaces it."""
+    found = set()
+    for file in (path / MANIFEST, path / RESULTS, *path.glob(f"{CHUNKS}/*.h5")):
+        with suppress(OSError):
+            is_of = file.stat()
+            found.add((file.name, is_of.st_ino, is_of.st_mtime_ns))
+    return found
+
+
+def finished_cases(path: Path, place: str = CHUNKS) -> Finished:
+    """Finished cases, each once.
 
     Args:
         path: the sweep's folder.
-        report: called with a message for every damaged file; None: leave it in place.
         place: `CHUNKS`, or `SCREEN` for those that the linear model has finished.
     """
     code = "status" if place == CHUNKS else "screen_status"
     check_results(path)
     files = [path / RESULTS] if (path / RESULTS).is_file() else []
+    damaged = []
     for _, chunk in _chunk_files(path / place):
         if file_hash(chunk) == _CHUNK.fullmatch(chunk.name)[2]:  # type: ignore[index]
             files.append(chunk)
-        elif report is not None:
-            report(f"{chunk.name} is damaged; its cases run again")
-            chunk.rename(chunk.with_suffix(".damaged"))
+        else:
+            damaged.append(chunk)
     ids, sources, rows = [], [], []
     kept: list[Path] = []
     for file in files:
@@ -443,15 +490,17 @@ def finished_cases(
                 raise StudyError(
                     f"{file}: damaged ({error}); remove it to run its cases again"
                 ) from None
+            damaged.append(file)
             continue
         ids.append(names[is_run])
         rows.append(np.flatnonzero(is_run))
         sources.append(np.full(is_run.sum(), len(kept)))
         kept.append(file)
     if not ids:
-        return Finished(np.empty(0, "S16"), np.empty(0, int), np.empty(0, int), [])
+        return Finished(np.empty(0, "S16"), np.empty(0, int), np.empty(0, int), [], damaged)
     case_id, first = np.unique(np.concatenate(ids), return_index=True)
-    return Finished(case_id, np.concatenate(sources)[first], np.concatenate(rows)[first], kept)
+    places = np.concatenate(sources)[first], np.concatenate(rows)[first]
+    return Finished(case_id, *places, kept, damaged)
 
 
 def _check_columns(store: h5py.File, count: int) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,9 +24,12 @@ from studies.engine.columns import (
 from studies.engine.folder import (
     BASELINE,
     CHUNKS,
+    MANIFEST,
     RESULTS,
+    Finished,
     finished_cases,
     read_manifest,
+    steady,
 )
 from studies.engine.stored import gather
 from studies.errors import StudyError, field_error, nearest
@@ -51,6 +55,7 @@ class SweepData:
     spec: SweepSpec
     cases: CaseTable | None = None  # where they are at hand, or not all of the sweep's
     baseline: dict[str, Variable] = field(default_factory=dict)  # without control; {}: not known
+    notes: tuple[str, ...] = ()  # why finished cases of its folder are not among them
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self.variables[name].data
@@ -96,8 +101,14 @@ def swept_names(data: SweepData) -> list[str]:
 
 
 def as_sweep(sweep: SweepData | str | Path) -> SweepData:
-    """What a function of a sweep is given: its data, or its folder; errors as `read_sweep`."""
-    return sweep if isinstance(sweep, SweepData) else read_sweep(sweep)
+    """What a function of a sweep is given: its data, or its folder, with a warning of its notes.
+
+    Errors as `read_sweep`.
+    """
+    data = sweep if isinstance(sweep, SweepData) else read_sweep(sweep)
+    for note in data.notes if data is not sweep else ():
+        warnings.warn(note, stacklevel=3)
+    return data
 
 
 def read_sweep(path: str | Path, cases: CaseTable | None = None) -> SweepData:
@@ -112,7 +123,11 @@ def read_sweep(path: str | Path, cases: CaseTable | None = None) -> SweepData:
     """
     if not isinstance(path, str | os.PathLike):
         raise field_error("path", path, "the folder of a sweep")
-    folder = Path(path)
+    data: SweepData = steady(Path(path), lambda: _read(Path(path), cases))
+    return data
+
+
+def _read(folder: Path, cases: CaseTable | None) -> SweepData:
     written = read_manifest(folder)["spec"]
     spec = parse_sweep(written)
     baseline = read_baseline(folder, spec)
@@ -126,11 +141,30 @@ def read_sweep(path: str | Path, cases: CaseTable | None = None) -> SweepData:
         if is_whole:  # otherwise an extension has started
             return SweepData(variables, attributes, spec, cases, baseline)
     table = build_table(spec) if cases is None else cases
-    gathered = gather(table, finished_cases(folder))
+    finished = finished_cases(folder)
+    gathered = gather(table, finished)
     axes = axis_variables(spec.study, axis_sizes(gathered), table.columns)
     variables = case_variables(table) | gathered | axes
     variables = with_coordinates(variables)
-    return SweepData(variables, {"title": spec.study.title}, spec, table, baseline)
+    notes = tuple(_not_shown(folder, table, finished))
+    return SweepData(variables, {"title": spec.study.title}, spec, table, baseline, notes)
+
+
+def _not_shown(folder: Path, table: CaseTable, finished: Finished) -> Iterator[str]:
+    """Why finished cases of a folder are not shown."""
+    strange = int(np.sum(~np.isin(finished.case_id, table.case_id)))
+    if strange:
+        has = "case in this folder is" if strange == 1 else "cases in this folder are"
+        yield (
+            f"{strange:,} finished {has} not of this sweep: {folder / MANIFEST} has another study "
+            "or other axes than the one that ran them. They are not shown."
+        )
+    if finished.damaged:
+        names = ", ".join(chunk.name for chunk in finished.damaged[:3])
+        yield (
+            f"{len(finished.damaged):,} of the files in {folder / CHUNKS} are damaged ({names}): "
+            "their cases count as not run yet, and run again with --resume."
+        )
 
 
 #: Axes of what the baseline's file holds beside metrics.
@@ -333,14 +367,19 @@ def _worst(
 
 
 def counted_links(data: SweepData) -> np.ndarray:
-    """Links that a metric counts, (n,).
+    """Links that a metric of a sweep counts, (n,)."""
+    return links_of(data.spec, data.table)
+
+
+def links_of(spec: SweepSpec, table: CaseTable) -> np.ndarray:
+    """Links that a metric of some cases counts, (n,).
 
     Those of `sweep.links`, else those that any case controls, all if none does: the same for all
     cases; otherwise fewer controlled links would look like less vibration.
     """
-    if named := data.spec.sweep.links:
-        return np.isin(np.arange(data.spec.study.n_links) + 1, named)
-    is_counted = np.any(controlled(data.table), axis=0)
+    if named := spec.sweep.links:
+        return np.isin(np.arange(spec.study.n_links) + 1, named)
+    is_counted = np.any(controlled(table), axis=0)
     return is_counted if is_counted.any() else np.ones_like(is_counted)
 
 

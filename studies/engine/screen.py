@@ -209,6 +209,6 @@ def next_round(
     return last._replace(first=order[: min(needed, FURTHER * so_far)])
 
 
-def screened_cases(folder: Path, report: Callable[[str], object] | None = None) -> Finished:
-    """Where the results of the linear model are; arguments as `finished_cases`."""
-    return finished_cases(folder, report, SCREEN)
+def screened_cases(folder: Path) -> Finished:
+    """Where the results of the linear model are."""
+    return finished_cases(folder, SCREEN)

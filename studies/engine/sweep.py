@@ -19,15 +19,18 @@ from studies import config
 from studies.engine.baseline import keep_baseline
 from studies.engine.chunks import Done, LocalRunner, Lost, Runner
 from studies.engine.folder import (
+    CONTENT,
     SCREEN,
     Finished,
     SweepFolder,
+    check_resumed,
     finished_cases,
     make_manifest,
     open_folder,
 )
 from studies.engine.plan import Group, Layout, local_layout, plan_groups
 from studies.engine.progress import Phases, Reporter
+from studies.engine.results import links_of
 from studies.engine.screen import (
     Round,
     check_screen_names,
@@ -42,7 +45,7 @@ from studies.engine.screen import (
 from studies.engine.stored import chunk_arrays, kept_metrics, manifest_attributes, merge
 from studies.errors import StudyError
 from studies.publish import shown
-from studies.space.spec import SweepSpec
+from studies.space.spec import READING, SELECTING, SPREADING, SweepSpec
 from studies.space.table import CaseTable, build_table
 from studies.study.fields import idle_axes
 
@@ -96,7 +99,8 @@ def make_plan(spec: SweepSpec, out: Path | None = None) -> Plan:
     check_screen_names(spec, table)
     rows = np.arange(len(table))
     if out is not None:
-        rows = _rows_left(table, finished_cases(out).case_id, out)
+        before, _ = _joined(out, spec, table, make_manifest(spec.data))
+        rows = np.flatnonzero(~np.isin(table.case_id, before.case_id))
     n_before, groups = len(table) - len(rows), []
     if spec.screen is not None:
         groups = screen_groups(table, rows, local_layout, spec.screen)
@@ -144,14 +148,13 @@ def run_sweep(
         kept_metrics(spec)
         table = build_table(spec)
         check_screen_names(spec, table)
-        before = finished_cases(out, say).case_id
-        _rows_left(table, before, out)  # refuses another sweep
-        folder.begin(manifest)
+        before, screened_before = _joined(out, spec, table, manifest)
+        folder.begin(manifest, (*before.damaged, *screened_before.damaged), say)
         run = _Run(spec, table, folder, runner, phases, stop)
         if spec.screen is None:
             rows, screened = run.full(np.arange(len(table)), _headline), None
         else:
-            rows, screened = run.screened(screened_cases(out, say))
+            rows, screened = run.screened(screened_before)
         if rows is not None:
             phases.begin("join")
             finished = finished_cases(out)
@@ -164,7 +167,7 @@ def run_sweep(
         return Outcome(
             out=out,
             table=table,
-            n_done=len(before) + run.n_run,
+            n_done=len(before.case_id) + run.n_run,
             n_run=run.n_run,
             compile_time=run.compile_time,
             run_time=run.run_time,
@@ -319,21 +322,43 @@ def _kept_headline(table: CaseTable, groups: list[Group], n_before: int) -> str:
     return f"{text}, {n_before} more already computed" if n_before else text
 
 
-def _rows_left(table: CaseTable, done: np.ndarray, out: Path) -> np.ndarray:
-    """Remaining cases. A resumed sweep can have more cases than the existing one, but not fewer.
+def case_content(spec: SweepSpec, table: CaseTable) -> dict[str, Any]:
+    """What of a request, beside its cases' parameters, decides what is stored for a case.
+
+    Parameters are in the ids of cases. Of `[sweep]` everything decides, except what says which
+    cases there are and what is looked at once they are finished.
+    """
+    content = spec.sweep.model_dump(mode="json", exclude={*SPREADING, *READING, "screen"})
+    content |= {"metrics": sorted(kept_metrics(spec)), "robustness": sorted(content["robustness"])}
+    if spec.screen is None:
+        return content
+    of_screen = spec.screen.model_dump(mode="json", exclude=SELECTING)
+    of_screen["links"] = links_of(spec, table).tolist()  # its values are taken over them
+    return content | {f"screen.{name}": value for name, value in of_screen.items()}
+
+
+def _joined(
+    out: Path, spec: SweepSpec, table: CaseTable, manifest: dict[str, Any]
+) -> tuple[Finished, Finished]:
+    """What a folder has already, of the whole model and of the screen; completes the manifest.
+
+    A resumed sweep can have more cases than the existing one, but not fewer.
 
     Raises:
-        StudyError: finished cases that are not part of it.
+        StudyError: what it has would not fit the other cases, or is not part of this sweep.
     """
-    strange = int(np.sum(~np.isin(done, table.case_id)))
+    manifest[CONTENT] = case_content(spec, table)
+    check_resumed(out, manifest)
+    done = finished_cases(out)
+    strange = int(np.sum(~np.isin(done.case_id, table.case_id)))
     if strange:
         raise StudyError(
-            f"--resume: {strange} of {len(done)} finished cases in {out} are not part of this "
-            "sweep; an extended sweep keeps all cases of the old one (same study, seed and axes; "
-            "more values or points; for a Latin hypercube the same size). Name a new folder for "
-            "another sweep"
+            f"--resume: {strange} of {len(done.case_id)} finished cases in {out} are not part of "
+            "this sweep; an extended sweep keeps all cases of the old one (same study, seed and "
+            "axes; more values or points; for a Latin hypercube the same size). Name a new folder "
+            "for another sweep"
         )
-    return np.flatnonzero(~np.isin(table.case_id, done))
+    return done, screened_cases(out)
 
 
 def _check_whole(table: CaseTable, rows: np.ndarray, done: np.ndarray, out: Path) -> None:

@@ -14,6 +14,7 @@ from studies.publish import REPORT, replacing
 from studies.screen.shards import CANDIDATES, ScreenRequest
 from studies.screen.tally import BUCKETS, GROWTH, LEAST, N_ENDINGS, Tally, nothing
 from studies.space.axes import LABELS
+from studies.space.spec import SPREADING
 from studies.space.table import CaseTable, as_python
 from studies.store import Variable, numbers_digest, read_store, write_store
 from studies.study.template import toml_text, toml_value
@@ -29,8 +30,6 @@ _CHECKED = {
     "precision": "--precision",
     "jaxlib": "version of jaxlib",
 }
-#: Fields of a sweep that say which designs there are; `best.toml` names its cases instead.
-_SPREADING = {"method", "axes", "blocks", "cases", "count", "size", "levels", "where", "seed"}
 
 
 def begin(folder: Path, screen: ScreenRequest) -> tuple[np.ndarray, Tally]:
@@ -144,7 +143,8 @@ def _interval_names(screen: ScreenRequest) -> list[str]:
 def best_sweep(screen: ScreenRequest, kept: CaseTable) -> str:
     """The kept designs as the file of a sweep, best first, whose cases have the same ids."""
     data = screen.spec.data
-    written = {name: x for name, x in data["sweep"].items() if name not in _SPREADING}
+    # it names its cases instead
+    written = {name: x for name, x in data["sweep"].items() if name not in SPREADING}
     links = list(screen.spec.sweep.links)  # also where the designs kept control fewer
     sweep: dict[str, Any] = written | {"method": "list", "by": screen.by, "links": links}
     sweep.pop("fidelity", None)

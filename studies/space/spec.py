@@ -101,6 +101,13 @@ class BlockNode(NamedTuple):
     path: str
 
 
+#: What says which cases there are.
+SPREADING = {*Block.model_fields, "where", "seed"}
+#: What says how finished cases are counted and ranked, of a sweep and of its screen.
+READING = {"repeats", "by", "links", "environments", "over"}
+SELECTING = {"keep", "subject_to"}
+
+
 class SweepSpec(NamedTuple):
     """A sweep as requested."""
 

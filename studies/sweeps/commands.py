@@ -6,7 +6,7 @@ import re
 import sys
 from pathlib import Path
 from shlex import quote
-from typing import Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 from rich.console import Console
@@ -24,6 +24,9 @@ from studies.errors import StudyError
 from studies.publish import EXPLORER, REPORT, announce
 from studies.show.document import AsJson, print_document
 
+if TYPE_CHECKING:
+    from studies.engine.results import SweepData
+
 #: Replaced in names of files: the brackets of entries.
 _NO_NAME = r"[^\w.-]+"
 #: Of the commands that look for the smallest change that breaks a design.
@@ -38,6 +41,16 @@ Folder = Annotated[Path, typer.Argument(help="folder of a sweep")]
 
 #: From so many cases on, workers of this machine are worth their start.
 LARGE = 50_000
+
+
+def _read(folder: Path) -> SweepData:
+    """A sweep; says what of its folder is not shown."""
+    from studies.engine.results import read_sweep
+
+    data = read_sweep(folder)
+    for note in data.notes:
+        print(f"studies: {note}", file=sys.stderr)
+    return data
 
 
 def add_commands(app: typer.Typer, console: Console) -> None:
@@ -159,11 +172,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         as_json: AsJson = False,
     ) -> None:
         """Show statuses and best cases of a sweep, or its failed cases."""
-        from studies.engine.results import read_sweep
         from studies.sweeps.show import print_causes
         from studies.sweeps.show import show as show_sweep
 
-        data = read_sweep(folder)
+        data = _read(folder)
         if as_json:
             from studies.sweeps.documents import show_document
 
@@ -190,7 +202,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             raise StudyError("--tolerance: for --breaks only; give both")
         if breaks:
             start()
-        from studies.engine.results import direction, read_sweep
+        from studies.engine.results import direction
         from studies.sweeps.show import (
             counted_text,
             print_cases,
@@ -199,7 +211,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             ranked_cases,
         )
 
-        data, name = read_sweep(folder), by.removeprefix("-")
+        data, name = _read(folder), by.removeprefix("-")
         agreed = ""
         if data.spec.sweep.fidelity == "linear":
             start()
@@ -247,12 +259,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         ] = None,
     ) -> None:
         """Plot a sweep; the axes determine the kind of figure."""
-        from studies.engine.results import read_sweep
         from studies.sweeps.plots import plot as draw
         from studies.sweeps.plots import save_plot
         from studies.sweeps.show import print_left_out, ranking
 
-        data = read_sweep(folder)
+        data = _read(folder)
         y = y or ranking(data)
         parts = (("", y), ("-over-", x), ("-by-", hue))
         name = "".join(f"{word}{part}" for word, part in parts if part)
@@ -268,12 +279,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         as_json: AsJson = False,
     ) -> None:
         """Show which parameters matter, from a sweep with method morris or saltelli."""
-        from studies.engine.results import read_sweep
         from studies.show.listing import Rows, print_rows
         from studies.sweeps.sensitivity import analyse
         from studies.sweeps.show import label
 
-        data = read_sweep(folder)
+        data = _read(folder)
         analysis = analyse(data, by)
         if as_json:
             from studies.sweeps.documents import sensitivity_document

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from jaxmodel import status
-from studies.engine.folder import MANIFEST, finished_cases
 from studies.engine.results import (
     SweepData,
     direction,
@@ -66,7 +65,7 @@ def explore_sweep(
     rank = ranking(data)
     codes = data["status"]
     if not _has_numbers(data, rank):
-        why = " ".join(_strangers(folder, data)) or "so there is nothing to explore"
+        why = " ".join(data.notes) or "so there is nothing to explore"
         raise StudyError(f"{folder}: no case has {rank}; {why}")
     names = [rank, *(x for x in (MARGIN, *BESIDE, *kept_metrics(data.spec)) if x != rank)]
     figures = [_figure(data, x) for x in dict.fromkeys(names) if _has_numbers(data, x)]
@@ -86,7 +85,7 @@ def explore_sweep(
             ".h5",
         ),
         placement=_placement(data.table),
-        notes=(*_strangers(folder, data), *_warnings(data, rank)),
+        notes=(*data.notes, *_warnings(data, rank)),
         about=_about(data),
     )
     n_ok = int(np.sum(codes == status.OK))
@@ -106,19 +105,6 @@ def _about(data: SweepData) -> dict[str, str]:
         "varied": f"{varied} ({data.spec.sweep.method})",
         "baseline": baseline_text(data.spec.study),
     }
-
-
-def _strangers(folder: Path, data: SweepData) -> tuple[str, ...]:
-    """That some finished cases are none of the sweep, if they are."""
-    found = finished_cases(folder).case_id
-    count = int(np.sum(~np.isin(found, data.table.case_id)))
-    if not count:
-        return ()
-    has = "case in this folder is" if count == 1 else "cases in this folder are"
-    return (
-        f"{count:,} finished {has} not of this sweep: {folder / MANIFEST} has another study or "
-        "other axes than the one that ran them. They are not shown.",
-    )
 
 
 def _warnings(data: SweepData, rank: str) -> tuple[str, ...]:

@@ -13,10 +13,10 @@ from jaxmodel import status
 from studies.engine.fidelity import agreement
 from studies.engine.results import (
     SweepData,
+    as_sweep,
     counted_links,
     direction,
     metric_values,
-    read_sweep,
     swept_names,
 )
 from studies.errors import StudyError, shown
@@ -72,7 +72,7 @@ def write_sweep_report(folder: str | Path) -> None:
         StudyError: no sweep there, or a file cannot be written.
     """
     folder = Path(folder)
-    data = read_sweep(folder)
+    data = as_sweep(folder)
     metric = ranking(data)
     drawn = [MACHINE]
     drawings: dict[str, Callable[[], Figure]] = {

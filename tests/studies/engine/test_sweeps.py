@@ -421,10 +421,10 @@ def test_chunks_lost_while_it_runs_are_noticed(tmp_path):
 
 
 def test_extended_sweep_runs_only_new_cases(tmp_path):
-    def spec(count, modes):
+    def spec(count, modes, **more):
         axes = MIXED["axes"] | {"controlled_modes": modes, "link_subsets": ["1", "1+2+3"]}
         inner = MIXED["blocks"][0] | {"count": count}
-        return noisy_spec({"axes": axes, "blocks": [inner]})
+        return noisy_spec({"axes": axes, "blocks": [inner], **more})
 
     out, longest = tmp_path / "s", spec(4, [1, 2, 3])
     run(spec(2, [2, 3]), out)
@@ -440,8 +440,7 @@ def test_extended_sweep_runs_only_new_cases(tmp_path):
     assert longer.n_run == 48 - 16 and longer.n_done == 48
     run(longest, tmp_path / "whole")
     assert_same(arrays(tmp_path / "whole"), arrays(out), 1e-9)
-    other = spec(4, [1, 2, 3])
-    other.data["sweep"]["metrics"] = ["residual_rms"]
+    other = spec(4, [1, 2, 3], metrics=["residual_rms"])
     with pytest.raises(StudyError, match="keeps the same"):
         run(other, out, is_resumed=True)
     before = (out / "sweep.json").read_bytes()
