@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from threading import Lock
+from typing import Any
 
 #: Begin of the names of threads that may still compile when a command is interrupted.
 COMPILING = "compiling"
@@ -33,10 +34,18 @@ class SharedSetting:
 
 
 def _limit_blas() -> Callable[[], object]:
-    from threadpoolctl import threadpool_limits
+    from threadpoolctl import OpenBLASController, threadpool_limits
 
-    return threadpool_limits(1, "blas").restore_original_limits
+    def as_any_thread(work: Callable[[], Any]) -> Any:
+        # it obeys one thread alone, the first that has called it, as long as that lives
+        OpenBLASController.clear_controlling_thread(force=True)
+        return work()
+
+    limits = as_any_thread(lambda: threadpool_limits(1, "blas"))
+    return lambda: as_any_thread(limits.restore_original_limits)
 
 
-#: NumPy's matrix operations on one thread each: more only slow down many small matrices.
+#: Matrix operations of NumPy, SciPy and JAX's LAPACK on one thread each: more only slow down many
+#: small matrices, and those of several threads of Python wait for each other, now and then without
+#: end.
 serial_blas = SharedSetting(_limit_blas)

@@ -20,8 +20,9 @@ from studies.engine.programs import drop_programs, kept_jit
 from studies.engine.robustness import judge_robustness
 from studies.engine.stability import LoopFigures, run_report
 from studies.publish import shown
-from studies.study.cases import signed_power
+from studies.study.cases import as_numpy, signed_power
 from studies.study.spec import Study
+from studies.threads import serial_blas
 
 _simulate = kept_jit(static_argnums=(0, 2))(simulate)
 
@@ -31,7 +32,7 @@ class Run(NamedTuple):
 
     study: Study
     structure: Structure
-    case: Case
+    case: Case  # NumPy arrays
     result: Result  # NumPy arrays
     status: int  # code of `jaxmodel.status`; UNSTABLE and UNJUDGED come from the linearised loop
     loop: LoopFigures | None = None  # of its linearised sampled loop, if that is judged
@@ -57,6 +58,11 @@ def run_study(
         StudyError: pose out of reach, singular path, motion longer than the run, stiff feedback.
     """
     drop_programs()
+    with serial_blas():
+        return _run_and_judge(study, has_record, has_loop, has_margins)
+
+
+def _run_and_judge(study: Study, has_record: bool, has_loop: bool, has_margins: bool) -> Run:
     structure, case = check_run(study)
     if study.control.ratio_source == "own_run":
         case = with_ratio(case, _own_ratio(study, structure, case, has_record))
@@ -78,9 +84,9 @@ def run_study(
 
 def _run(study: Study, structure: Structure, case: Case, has_record: bool) -> Run:
     """Run a case without judging its loop."""
-    result = jax.tree.map(np.asarray, _simulate(structure, case, has_record))
+    result = as_numpy(_simulate(structure, case, has_record))
     code = int(result.status)
-    return Run(study=study, structure=structure, case=case, result=result, status=code)
+    return Run(study=study, structure=structure, case=as_numpy(case), result=result, status=code)
 
 
 def _margins(structure: Structure, case: Case, loop: LoopFigures) -> dict[str, np.ndarray]:
