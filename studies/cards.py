@@ -176,7 +176,7 @@ def _export(export: Any) -> Card:
 
     checks = [] if export.verified is None else export.verified.checks
     rows = [[x.what, x.found, x.allowed, "ok" if x.is_met else "FAILED"] for x in checks]
-    verdict = "verified" if export.is_good else "FAILED, not written"
+    verdict = "FAILED, not written" if export.has_failed else "verified"
     lines = [
         f"{export.target}: {verdict if checks else 'not verified'}",
         f"Files: {', '.join(map(str, export.files))}",

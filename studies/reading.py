@@ -66,14 +66,14 @@ def read_bytes(path: Path, most: int = LARGEST) -> bytes:
 
 
 def read_text(path: Path, most: int = LARGEST, encoding: str = "utf-8") -> str:
-    """The same as text.
+    """The same as text, without the mark by which some editors tell its encoding.
 
     Raises:
         OSError: as `read_bytes`.
         ValueError: not of this encoding.
     """
     try:
-        return read_bytes(path, most).decode(encoding)
+        return read_bytes(path, most).decode(encoding).removeprefix("\ufeff")
     except UnicodeDecodeError:
         raise ValueError(f"not {encoding.upper()} text") from None
 

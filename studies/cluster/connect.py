@@ -7,10 +7,11 @@ import logging
 import os
 import re
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from ipaddress import ip_address
-from multiprocessing import resource_tracker
+from multiprocessing import current_process, resource_tracker
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeVar
@@ -229,6 +230,8 @@ def _local_cluster(count: int) -> Iterator[Client]:
     """Workers on this machine that share its cores, or have one GPU each."""
     from distributed import Client, Nanny, Scheduler, SpecCluster
 
+    if getattr(current_process(), "_inheriting", False):  # a worker that imports the user's script
+        sys.exit(1)  # the process that starts it says why
     cores = usable_cores()
     if not 1 <= count <= cores:
         raise field_error("--local-workers", count, f"1 to {cores}, the cores of this machine")
@@ -244,10 +247,18 @@ def _local_cluster(count: int) -> Iterator[Client]:
         try:
             cluster = SpecCluster(workers, heart, silence_logs=logging.CRITICAL)
         except (OSError, RuntimeError) as error:  # OSError covers timeouts
-            reason = str(error).partition("\n")[0] or type(error).__name__
+            reason = _unguarded() or str(error).partition("\n")[0] or type(error).__name__
             raise StudyError(f"--local-workers: workers do not start ({reason})") from None
     with cluster, Client(cluster, timeout=PATIENCE, set_as_default=False) as client:
         yield client
+
+
+def _unguarded() -> str:
+    """What the user's script lacks if workers, which import it, would run it again; "" if not."""
+    script = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
+    if not script.is_file() or "__main__" in script.read_text("utf-8", errors="replace"):
+        return ""
+    return f'they import {script}: put what it does under if __name__ == "__main__":'
 
 
 @contextmanager

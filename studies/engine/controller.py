@@ -17,6 +17,7 @@ from studies.engine.channels import ActiveChannels, fold
 from studies.engine.preflight import check_machine, preflight
 from studies.engine.runs import resolved_study
 from studies.errors import StudyError, field_error
+from studies.study.cases import as_numpy
 from studies.study.spec import Study
 
 
@@ -71,7 +72,7 @@ def fixed_controller(study: Study) -> FixedController:
     return FixedController(
         study=study,
         structure=structure,
-        case=case,
+        case=as_numpy(case),
         controller=controller,
         channels=arrange(controller, study.control.law),
         taps=_merge_taps(taps),

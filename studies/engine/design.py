@@ -28,6 +28,22 @@ class Design(NamedTuple):
     case_id: str = ""  # of the case in its sweep
 
 
+def as_design(given: Design | Study | str | Path) -> Design:
+    """A design from what stands for it: a study, or what `load_design` reads.
+
+    Raises:
+        StudyError: something else, or as `load_design`.
+    """
+    if isinstance(given, str | Path):
+        return load_design(given)
+    if not isinstance(given, Design | Study):
+        raise StudyError(
+            f"design: {type(given).__name__}; expected a design, as load_design returns, a study "
+            "or its file"
+        )
+    return Design(given, {}) if isinstance(given, Study) else given
+
+
 def load_design(path: str | Path, case: int | str | None = None) -> Design:
     """Read a DESIGN.
 

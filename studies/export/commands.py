@@ -70,11 +70,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if target is None:
             from studies.export.comparison import compare_variants
 
-            is_good = compare_variants(chosen, out, dac_bits, pil, console).is_good
+            has_failed = not compare_variants(chosen, out, dac_bits, pil, console).is_good
         else:
             made = export_design(chosen, target, out, verify, name, dac_bits, console, pil)
-            is_good = made.is_good
-        if not is_good:
+            has_failed = made.has_failed
+        if has_failed:
             sys.exit(1)
 
     @app.command("import-gains")

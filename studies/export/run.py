@@ -10,7 +10,7 @@ from rich.console import Console
 
 from studies import config
 from studies.engine.controller import FixedController, check_codable, fixed_controller
-from studies.engine.design import Design
+from studies.engine.design import Design, as_design
 from studies.engine.preflight import check_run
 from studies.errors import StudyError, field_error, nearest
 from studies.export.compiler import NO_COMPILER, find_compiler
@@ -22,6 +22,7 @@ from studies.export.report import report
 from studies.export.targets import TARGETS
 from studies.export.verify import Verification
 from studies.publish import check_folder, publish, shown
+from studies.study.spec import Study
 
 REPORT, FAILED = "verification.html", "verification-failed.html"
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,30}")
@@ -39,15 +40,20 @@ class Exported(NamedTuple):
 
     @property
     def is_good(self) -> bool:
-        """Whether everything agreed; the controller is written only then."""
-        return self.verified is None or self.verified.is_passed
+        """Whether everything agreed; not so where nothing was compared."""
+        return self.verified is not None and self.verified.is_passed
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether a comparison failed: then the controller is not written."""
+        return self.verified is not None and self.verified.has_failed
 
     def _repr_html_(self) -> str:
         return shown(self)
 
 
 def export_design(
-    design: Design,
+    design: Design | Study | str | Path,
     target: str,
     out: str | Path,
     is_verified: bool | None = None,
@@ -59,7 +65,7 @@ def export_design(
     """Write a controller, verified if requested.
 
     Args:
-        design: what to export.
+        design: what to export; or its study, or what `load_design` reads.
         target: one of `TARGETS`.
         out: folder for the files, created if missing.
         is_verified: whether to compare with the JAX controller; None: if there is a compiler.
@@ -70,11 +76,12 @@ def export_design(
             `studies.export.firmware.boards.BOARDS`; None: neither.
 
     Returns:
-        what was written and compared; `is_good`: whether everything agreed.
+        what was written and compared; `is_good`: whether something was, and everything agreed.
 
     Raises:
         StudyError: an argument out of range, or a controller that cannot be exported.
     """
+    design = as_design(design)
     _check_arguments(target, name, dac_bits)
     bits = checked_bits(dac_bits)
     board = checked_board(pil)
@@ -120,13 +127,13 @@ def export_design(
         if Path(file).name != file or file.startswith("."):
             raise StudyError(f"--target {target}: it makes {file!r}; expected a plain file name")
     verified = result.verified
-    is_good = verified is None or verified.is_passed
-    texts = result.files if is_good else {}  # files of an earlier export stay unchanged
+    has_failed = verified is not None and verified.has_failed
+    texts = {} if has_failed else result.files  # files of an earlier export stay unchanged
     if verified is not None:
         text = report(exported, job.origin, result)
-        texts |= {REPORT if is_good else FAILED: text}
+        texts |= {FAILED if has_failed else REPORT: text}
         _print_verdict(verified, console)
-    with publish(out, stale=(REPORT, FAILED) if is_good else ()) as staging:
+    with publish(out, stale=() if has_failed else (REPORT, FAILED)) as staging:
         for file, text in texts.items():
             (staging / file).write_text(text, encoding="utf-8")
     for file in texts:

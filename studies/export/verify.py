@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -27,8 +28,9 @@ from studies.export.integers import respond as respond_fixed
 from studies.export.sequences import hard_sequences, stuck_at_end
 from studies.study.labels import describe
 
-#: Limit for double precision against JAX, largest difference over largest value [1].
-DOUBLE = 1e-12
+#: Limit for double precision against JAX, largest difference over largest value [1]; where the same
+#: arithmetic rounds more, that so many times, up to the last one.
+DOUBLE, ROUNDINGS, WORST = 1e-12, 10.0, 1e-9
 #: Limit for single precision, beyond which it is useless.
 SINGLE = 1e-3
 #: Allowed share of samples in which rounding decides which of two rivals acts [1].
@@ -63,6 +65,7 @@ class Exchange(NamedTuple):
     sensor: np.ndarray  # (T, 3, K)
     actuator: np.ndarray  # (T, 3, K)
     largest: float = 0.0  # voltage that the arithmetic rounds, where it exceeds them [V]
+    allowed: float = 0.0  # difference in double precision, over the largest voltage [1]
 
 
 class Verification(NamedTuple):
@@ -88,7 +91,13 @@ class Verification(NamedTuple):
 
     @property
     def is_passed(self) -> bool:
-        return all(check.is_met for check in self.checks)
+        """Whether something was compared and everything agreed."""
+        return bool(self.checks) and not self.has_failed
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether any comparison failed: then no controller is written."""
+        return not all(check.is_met for check in self.checks)
 
 
 def vibration(run: LoopRun) -> float:
@@ -108,19 +117,12 @@ def verify_document(
     """A controller built only from its document, against the JAX controller."""
     controller, taps = controller_of(document)
     channels = arrange(controller, document.law)
-    checks = [
-        compare_values(
-            f"open loop, {name}",
-            respond_floating(channels, controller, codes).command,
-            _replay(exported, codes),
-            DOUBLE,
-            _largest_demand(exported, codes),
-        )
-        for name, codes in {
-            "recorded codes": reference.codes,
-            **_hard_codes(exported, reference),
-        }.items()
-    ]
+    checks = []
+    for name, codes in _sequences(exported, reference).items():
+        values = respond_floating(channels, controller, codes).command
+        largest, allowed = _limits(exported, codes)
+        what, expected = f"open loop, {name}", _replay(exported, codes)
+        checks.append(compare_values(what, values, expected, allowed, largest))
     path, shaped = reference_path(exported)
     checks.append(
         compare_values("shaper, the case's motion", _shape_reference(taps, path), shaped, DOUBLE)
@@ -138,13 +140,12 @@ def verify_floating(
     """C in double and single precision against the JAX controller."""
     checks, runs, exchanges = [], {"JAX": reference}, dict[str, Exchange]()
     with load_code(exported, source, name, compiler, np.float64, np.float64) as code:
-        sequences = {"recorded codes": reference.codes, **_hard_codes(exported, reference)}
-        for label, codes in sequences.items():
+        for label, codes in _sequences(exported, reference).items():
             sensor, expected = codes * float(exported.controller.adc_step), _replay(exported, codes)
-            largest = _largest_demand(exported, codes)
-            exchanges[label] = Exchange(sensor, expected, largest)
+            largest, allowed = _limits(exported, codes)
+            exchanges[label] = Exchange(sensor, expected, largest, allowed)
             volts, faults = code.respond(sensor)
-            check = compare_values(f"open loop, {label}", volts, expected, DOUBLE, largest)
+            check = compare_values(f"open loop, {label}", volts, expected, allowed, largest)
             checks.append(check._replace(is_met=check.is_met and not faults.any()))
         step = float(exported.controller.adc_step)
         checks += check_faults(exported, code, reference, None)
@@ -271,21 +272,39 @@ def _hard_codes(exported: FixedController, reference: LoopRun) -> dict[str, np.n
     return hard_sequences(reference.codes, top, rail)
 
 
+def _sequences(exported: FixedController, reference: LoopRun) -> dict[str, np.ndarray]:
+    """Codes for the open loop, by name."""
+    return {"recorded codes": reference.codes, **_hard_codes(exported, reference)}
+
+
 def _replay(exported: FixedController, codes: np.ndarray) -> np.ndarray:
     return np.asarray(replay(exported.controller, codes))
 
 
-def _largest_demand(exported: FixedController, codes: np.ndarray) -> float:
-    """Largest voltage that the arithmetic rounds [V]: of the demands if a system is told of limits.
+def _limits(exported: FixedController, codes: np.ndarray) -> tuple[float, float]:
+    """Largest voltage that the arithmetic rounds [V], 0 if it is that of the actuators; and the
+    difference that double precision is allowed, over the largest voltage [1].
 
-    Demands can be a thousand times the limit, and what limits take away from them enters the state.
+    Demands can be a thousand times the limit, and what limits take away from them enters the state
+    of a system that is told of it. Slow poles, or states of unlike size, add up what is rounded:
+    how much, the same arithmetic says in extended precision.
     """
-    blocks = exported.channels
-    if not isinstance(blocks, ModalBlocks) or blocks.system.anti_windup is None:
-        return 0.0
-    signals = respond_floating(blocks, exported.controller, codes)
-    assert isinstance(signals, BlockSignals)
-    return float(np.abs(signals.demand).max())
+    blocks, controller = exported.channels, exported.controller
+    rounded = respond_floating(blocks, controller, codes)
+    blocks, controller = jax.tree.map(_extended, (blocks, controller))
+    exact = respond_floating(blocks, controller, codes)
+    largest = 0.0
+    if isinstance(blocks, ModalBlocks) and blocks.system.anti_windup is not None:
+        assert isinstance(rounded, BlockSignals)
+        largest = float(np.abs(rounded.demand).max())
+    size = max(float(np.abs(exact.command).max()), largest)
+    away = float(np.abs(rounded.command - exact.command).max()) / (size if size > 0 else 1.0)
+    return largest, min(max(DOUBLE, ROUNDINGS * away), WORST)
+
+
+def _extended(x: Any) -> Any:
+    is_real = isinstance(x, np.ndarray | np.generic) and x.dtype == np.float64
+    return np.asarray(x, np.longdouble) if is_real else x
 
 
 def compare_values(

@@ -109,7 +109,7 @@ def _cell(text: str, where: str) -> float:
 
 
 def _from_csv(where: Path) -> dict[str, np.ndarray]:
-    lines = read_text(where, encoding="utf-8-sig").splitlines(keepends=True)
+    lines = read_text(where).splitlines(keepends=True)
     lines = [line for line in lines if line.strip() and not line.startswith("#")]
     if len(lines) < 2:
         raise ValueError("needs a row of names and one of numbers or more")

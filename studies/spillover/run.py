@@ -12,7 +12,7 @@ from jaxmodel.changes import MachineChange
 from jaxmodel.laws import LAWS
 from studies.engine.breaking import TOLERANCES, smallest_change
 from studies.engine.controller import fixed_controller
-from studies.engine.design import Design
+from studies.engine.design import Design, as_design
 from studies.engine.progress import Phases
 from studies.engine.run_data import run_attributes
 from studies.engine.runs import resolved_study
@@ -43,7 +43,7 @@ PHASES = ("judge", "smallest change", "fast move", "draw")
 
 
 def spillover_design(
-    design: Design,
+    design: Design | Study | str | Path,
     out: str | Path,
     margin: float = 2.0,
     console: Console | None = None,
@@ -55,7 +55,7 @@ def spillover_design(
     """Write the certificate of a design.
 
     Args:
-        design: what to judge.
+        design: what to judge; or its study, or what `load_design` reads.
         out: folder for the files, created if missing.
         margin: gain margin required on every plant [1].
         console: where messages go; default: standard output.
@@ -72,6 +72,7 @@ def spillover_design(
     Raises:
         StudyError: as `certify`, or a folder that cannot be written to.
     """
+    design = as_design(design)
     out, console = Path(out), console or Console(highlight=False, markup=False)
     check_folder(out)
     study = resolved_study(design.study)

@@ -202,6 +202,12 @@ def as_arrays(case: Tree) -> Tree:
     return arrays
 
 
+def as_numpy(case: Tree) -> Tree:
+    """Every leaf as a NumPy array: results can be unpickled where JAX is not to start yet."""
+    arrays: Tree = jax.tree.map(np.asarray, case)
+    return arrays
+
+
 def _machine(numbers: Numbers, structure: Structure, xp: Any) -> Machine:
     number = numbers.__getitem__
     joint_angle = _joint_angle(numbers, xp)

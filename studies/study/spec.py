@@ -119,6 +119,17 @@ class Section(BaseModel):
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, validate_default=True
     )
 
+    def __hash__(self) -> int:
+        """Equal for equal sections; pydantic's own fails for tables, such as `control.laws`."""
+        return hash(_hashable(dict(self)))
+
+
+def _hashable(value: Any) -> Any:
+    """Something of equal values that can be hashed: tables, at any depth, without their order."""
+    if isinstance(value, dict):
+        return frozenset((name, _hashable(entry)) for name, entry in value.items())
+    return tuple(map(_hashable, value)) if isinstance(value, tuple | list) else value
+
 
 class RunSection(Section):
     """Duration, resolution and model of the run."""

@@ -6,12 +6,13 @@ from pathlib import Path
 
 from rich.console import Console
 
-from studies.engine.design import Design
+from studies.engine.design import Design, as_design
 from studies.engine.progress import Phases
 from studies.engine.runs import resolved_study
 from studies.publish import REPORT, announce, check_folder, publish
 from studies.show import figures
 from studies.show.document import json_text
+from studies.study.spec import Study
 from studies.twin.compare import BothRuns, TwinBench, causes, check_supported, our_runs, pair
 from studies.twin.law import check_compiler
 from studies.twin.margin import first_modes, margin_by_growth, ring
@@ -25,7 +26,7 @@ PHASES = ("ours", "theirs", "changes", "poles", "draw")
 
 
 def twin_design(
-    design: Design,
+    design: Design | Study | str | Path,
     out: str | Path | None = None,
     console: Console | None = None,
     settings: Settings = DEFAULT,
@@ -34,7 +35,7 @@ def twin_design(
     """Repeat a design's loop with Exudyn and the exported controller, and compare.
 
     Args:
-        design: what to repeat.
+        design: what to repeat; or its study, or what `load_design` reads.
         out: folder for the report, the figure and the numbers; None: nothing is written.
         console: where messages go; default: standard output.
         settings: resolution of the twin.
@@ -43,6 +44,7 @@ def twin_design(
     Raises:
         StudyError: Exudyn or a C compiler is missing, or a study that the twin cannot repeat.
     """
+    design = as_design(design)
     exudyn = load_exudyn()
     check_compiler()
     check_supported(design.study)
@@ -93,8 +95,7 @@ def twin_design(
 
 def _write(out: Path, result: TwinResult) -> None:
     with publish(out) as staging:
-        with figures.styled():
-            figures.save(side_by_side(result.plan, result.runs), staging, FIGURE)
         text = json_text("twin", document(result))
         (staging / DOCUMENT).write_text(text, encoding="utf-8")
+        draw(staging, {FIGURE: partial(side_by_side, result.plan, result.runs)})
         (staging / REPORT).write_text(report(result, staging), encoding="utf-8")

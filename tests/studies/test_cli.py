@@ -368,7 +368,7 @@ def ideal(gain):
         (
             changed(metrics={"residual_delay": 0.03}),
             "run.duration = 0.05; allowed: 0.08 or more: nothing is left for the residual window "
-            "after the shaped motion of 0.03 s and metrics.residual_delay = 0.03; metrics.residual_",
+            "after the shaped motion of 0.03 s and metrics.residual_delay = 0.03; metrics.resid",
         ),
         (
             changed(control=ideal(1e6)),

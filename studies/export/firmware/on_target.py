@@ -155,7 +155,8 @@ def _compare(at: Comparison, label: str, values: np.ndarray, exchange: Exchange)
         differing = int(np.sum(values != wanted))
         text = f"{differing} of {values.size} codes differ"
         return Check(what, text, "0", differing == 0)
-    return compare_values(what, values, wanted, at.limit, exchange.largest)
+    limit = max(at.limit, exchange.allowed)
+    return compare_values(what, values, wanted, limit, exchange.largest)
 
 
 def _compare_here(

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -236,6 +237,25 @@ def test_a_tuning_has_the_same_slopes(cluster):
     for name, x, y in zip(wanted._fields, wanted, found, strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-12, err_msg=name)
     assert np.abs(found.slope).min() > 0
+
+
+def test_a_script_that_its_workers_would_run_again_is_told_so(tmp_path):
+    """One traceback, the user's own, whose last line names what is missing; three before."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import studies\n"
+        "from studies.cluster.connect import Workers, connected\n"
+        "studies.configure()\n"
+        "with connected(Workers(None, 1, 600.0), print):\n"
+        "    print('connected')\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.count("Traceback") == 1
+    assert done.stderr.endswith(
+        f"workers do not start (they import {script}: put what it does under "
+        'if __name__ == "__main__":)\n'
+    )
 
 
 def test_bad_options_are_refused(capsys, tmp_path, cluster, monkeypatch):

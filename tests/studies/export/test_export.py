@@ -21,6 +21,7 @@ from studies.export.document import _of_system, document, import_study, study_ha
 from studies.export.verify import AIM
 from studies.study.spec import load_study, paper_study
 from tests import TOP
+from tests.canonical import MACHINE, with_sections
 from tests.exports import (
     DESIGNS,
     needs_compiler,
@@ -96,6 +97,22 @@ def test_export_is_verified(capsys, designs, folders, name, target):
     if target == "c":
         assert "With float, recorded codes" in text and "precise enough" in text
         assert re.search(r"faulty sensor: NaN \| sensor \d, sample 1 ", report)
+
+
+@pytest.mark.long  # in short: the blocks of such a controller, in test_observers
+def test_an_observer_at_50_khz(capsys, tmp_path):
+    """Its poles crowd round 1: the verification failed by 8e-12."""
+    needs_compiler()
+    data = with_sections(
+        MACHINE,
+        run={"duration": 0.06},
+        control={"law": "lqg"},
+        electronics={"sample_rate_hz": 5e4},
+        motion={"waypoints": [[0.0, 0.0, 0.5236], [0.0, 0.002, 0.5236]], "move_time": 0.02},
+    )
+    path = write_study(tmp_path / "lqg.toml", data)
+    code, text, _ = run(capsys, "export", path, "--target", "c", "--out", tmp_path / "out")
+    assert code == 0 and "verified: " in text and "FAILED" not in text, text
 
 
 @pytest.mark.long

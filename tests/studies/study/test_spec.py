@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from studies import Study, StudyError, load_study, paper_study, parse_study
+from studies.reading import read_json
 from studies.study.explain import allowed_values
 from studies.study.template import STARTERS, starter_template, study_template, toml_value
 from studies.verify.prepared import prepared
@@ -219,6 +220,24 @@ def test_an_empty_file_and_the_template_are_the_default_study():
     assert parse_study({}) == Study()
     assert parse_study(tomllib.loads(study_template())) == Study()
     assert parse_study(tomllib.loads(starter_template())) == Study()
+
+
+def test_equal_studies_have_equal_hashes():
+    """Tables of laws' own fields, too, in any order; 0.0 and -0.0 are equal."""
+    laws = {"ppf": {"filter_damping": 0.2}, "lqg": {"model_damping": 0.02}}
+    own = parse_study({"control": {"laws": laws}, "load": {"wrench": [0.0, 0.0, 0.0]}})
+    laws = dict(reversed(laws.items()))
+    assert {own: 1}[parse_study({"control": {"laws": laws}, "load": {"wrench": [-0.0] * 3}})] == 1
+    assert hash(own.control) != hash(Study().control) and len({own, Study(), Study()}) == 2
+
+
+def test_a_byte_order_mark_is_no_text(tmp_path):
+    """Windows' editor puts one in front."""
+    text = '\ufefftitle = "µ"\n'
+    (tmp_path / "study.toml").write_text(text, encoding="utf-8")
+    assert load_study(tmp_path / "study.toml").title == "µ"
+    (tmp_path / "a.json").write_text('\ufeff{"a": 1}', encoding="utf-8")
+    assert read_json(tmp_path / "a.json") == {"a": 1}
 
 
 def test_the_file_to_start_from_has_few_fields_each_with_its_unit():
