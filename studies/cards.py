@@ -123,12 +123,14 @@ def _tuning(found: Any) -> Card:
 
 def _fit(fitted: Any) -> Card:
     """Of `fit` and `run_fit`."""
-    from studies.fitting.plots import all_figures
+    from studies.fitting.plots import drawings
     from studies.fitting.report import statements, value_rows
 
     heads = ["parameter", "value", "sigma", "unit", "95 %", ""]
-    drawn = next((figure for _, figure in all_figures(fitted)), None)
-    return Card(fitted.study.title, statements(fitted), heads, value_rows(fitted), figure=drawn)
+    drawing = next(iter(drawings(fitted).values()), None)
+    return Card(
+        fitted.study.title, statements(fitted), heads, value_rows(fitted), drawing and drawing()
+    )
 
 
 def _certificate(certificate: Any) -> Card:

@@ -39,8 +39,19 @@ class DataWarning(UserWarning):
     """A file of measurements holds other than its entry says."""
 
 
+class FigureWarning(UserWarning):
+    """A figure could not be drawn; its page says so in its place."""
+
+
 #: Warnings that the command line prints as one line.
-OWN_WARNINGS = (NoKernelWarning, ModelWarning, CacheWarning, ResolutionWarning, DataWarning)
+OWN_WARNINGS = (
+    NoKernelWarning,
+    ModelWarning,
+    CacheWarning,
+    ResolutionWarning,
+    DataWarning,
+    FigureWarning,
+)
 
 
 def warn_of_model(text: str) -> None:

@@ -24,6 +24,8 @@ from studies.errors import StudyError
 REPORT = "report.html"
 #: Of those whose cases can be looked at.
 EXPLORER = "explorer.html"
+#: End of the name of a file that says why a figure of that name is missing.
+FAULT = ".fault"
 #: Name prefix of the folders in which files are prepared.
 _STAGED = ".unfinished-"
 #: End of the name under which a file is written: the process (older ones had none), and what tells

@@ -6,6 +6,7 @@ where modes 2 and up matter.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +42,7 @@ from studies.engine.run_data import run_attributes
 from studies.engine.sweep import run_sweep, sweep_phases
 from studies.errors import StudyError
 from studies.publish import REPORT, publish
-from studies.show.figures import save, styled, write_figure
+from studies.show.figures import draw
 from studies.show.sketch import sketch
 from studies.space.spec import SweepSpec
 from studies.store import Variable, axis_sizes, write_store
@@ -142,10 +143,8 @@ def _finish(
     drawn = FIGURES if findings.subsets is None else FIGURES | MODE_FIGURES
     with publish(out, [f"{x}.{kind}" for x in MODE_FIGURES for kind in ("png", "pdf")]) as staging:
         write_store(staging / DATA, variables(findings), run_attributes(study))
-        with styled():
-            for name, draw in drawn.items():
-                save(draw(findings), staging, name, has_pdf)
-            write_figure(sketch(study), staging / "machine.png")
+        draw(staging, {name: partial(plot, findings) for name, plot in drawn.items()}, has_pdf)
+        draw(staging, {"machine": partial(sketch, study)})
         write_animation(findings, staging)
         (staging / REPORT).write_text(report(findings, dropped, staging), encoding="utf-8")
 

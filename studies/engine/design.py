@@ -2,29 +2,54 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxmodel import status
+from jaxmodel.lazy import jax
 from jaxmodel.metrics import METRICS
+from studies.engine.columns import ON_DEMAND, PER_CASE
 from studies.engine.folder import MANIFEST, TUNING, read_manifest
-from studies.engine.results import SweepData, read_sweep
+from studies.engine.results import ROUNDING, SweepData, read_sweep
+from studies.engine.robustness import judge_robustness
 from studies.engine.run_data import metric_variables
 from studies.engine.runs import Run
-from studies.errors import StudyError, field_error, nearest
+from studies.errors import DataWarning, StudyError, field_error, nearest
+from studies.reading import read_bytes
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table, case_study
 from studies.study.files import find_spec
 from studies.study.spec import Study, load_study
+from studies.study.template import is_edited
+
+#: Largest relative differences of a case run alone in single precision, and of its loop, which
+#: sweeps judge along frequencies and runs by eigenvalues [1].
+SINGLE, OF_LOOPS = 1e-2, 2e-2
+#: Of a loop: names of a sweep and of `LoopFigures`.
+_OF_LOOP = dict.fromkeys(ON_DEMAND, "") | {
+    "gain_margin": "gain_margin",
+    "breaking_frequency": "breaking_frequency",
+    "breaking_mode": "breaking_mode",
+    "damping_ratio": "least_damping",
+}
+_OF_RUN = (
+    "bad_time",
+    "command_end",
+    "sensor_condition",
+    "actuator_condition",
+    "singularity_distance",
+)
 
 
 class Design(NamedTuple):
     """One study and, for a case of a sweep, what the sweep found."""
 
     study: Study
-    stored: dict[str, np.ndarray]  # metrics and status of the sweep; {} if there is none
+    stored: dict[str, np.ndarray]  # all that the sweep has kept; {} if there is none
     case_id: str = ""  # of the case in its sweep
 
 
@@ -65,7 +90,11 @@ def load_design(path: str | Path, case: int | str | None = None) -> Design:
             raise StudyError(f"--case {case}: {path} is a file; leave --case out")
         return Design(load_study(path), {})
     if (path / TUNING).is_file():
-        return Design(load_study(_tuned_file(path, case)), {})
+        file = _tuned_file(path, case)
+        if is_edited(read_bytes(file).decode(errors="replace")):
+            text = f"{file}: edited since the tuning has written it; this is no longer its result"
+            warnings.warn(text, DataWarning, stacklevel=2)
+        return Design(load_study(file), {})
     data = read_sweep(path)
     number = _case_number(data, None if case is None else str(case), path)
     spec = parse_sweep(read_manifest(path)["spec"])
@@ -83,7 +112,7 @@ def load_design(path: str | Path, case: int | str | None = None) -> Design:
     case_id = str(data["case_id"][number])
     if code < 0 or spec.sweep.fidelity == "linear":  # nothing that the full model would repeat
         return Design(study, {}, case_id)
-    names = ["status", *(name for name in METRICS if name in data.variables)]
+    names = [name for name in (*PER_CASE, *METRICS) if name in data.variables]
     return Design(study, {name: data[name][number] for name in names}, case_id)
 
 
@@ -123,23 +152,55 @@ def _case_number(data: SweepData, case: str | None, path: Path) -> int:
 
 
 def deviation(run: Run, stored: dict[str, np.ndarray]) -> tuple[float, str]:
-    """Largest difference between a run's metrics and stored ones, relative to each metric's size.
+    """Largest of `deviations` of metrics, and of which one; (0, "") if there is none."""
+    found = ((x[0], name) for name, x in deviations(run, stored).items() if name in METRICS)
+    return max(found, default=(0.0, ""))
+
+
+def deviations(run: Run, stored: dict[str, np.ndarray]) -> dict[str, tuple[float, float]]:
+    """Differences between what a run has found and what a sweep has kept of the same case.
 
     Args:
-        run: the run.
-        stored: metrics of the same case; NaN where a mode does not exist.
+        run: the run; its loop is compared if it was judged.
+        stored: by name, NaN where there is nothing to compare with, such as a missing mode.
 
     Returns:
-        (difference [1], name of the metric); (0, "") if there is nothing to compare.
+        By name: difference relative to the largest entry [1], and how large that may be.
     """
-    metrics = {name: variable.data for name, variable in metric_variables(run.result).items()}
-    worst = (0.0, "")
-    for name, reference in stored.items():
-        if name == "status":
+    found = {}
+    for name, value in _numbers(run, stored).items():
+        if name not in stored or value is None:
             continue
-        own = np.asarray(metrics[name])
-        part = np.asarray(reference)[tuple(slice(0, n) for n in own.shape)]
-        size = np.nanmax(np.abs(part), initial=0.0)
-        difference = np.nanmax(np.abs(own - part), initial=0.0) / size if size > 0 else 0.0
-        worst = max(worst, (float(difference), name))
-    return worst
+        own, reference = map(np.atleast_1d, (value, stored[name]))
+        is_single = np.float32 in (own.dtype, reference.dtype)
+        allowed = OF_LOOPS if name in _OF_LOOP else SINGLE if is_single else ROUNDING
+        part = reference[tuple(slice(0, n) for n in own.shape)].astype(float)
+        own = own[tuple(slice(0, n) for n in part.shape)]
+        found[name] = _difference(own[~np.isnan(part)], part[~np.isnan(part)]), allowed
+    return found
+
+
+def _difference(own: np.ndarray, reference: np.ndarray) -> float:
+    differs = own != reference
+    if not differs.any():
+        return 0.0
+    if not np.isfinite((own[differs], reference[differs])).all():
+        return float("inf")
+    size = max(np.abs(x[np.isfinite(x)]).max() for x in (own, reference))
+    return float(np.abs(own[differs] - reference[differs]).max() / size)
+
+
+def _numbers(run: Run, names: Iterable[str]) -> dict[str, Any]:
+    """What a sweep can keep of a run, but its status; names: that it has kept."""
+    found = {name: variable.data for name, variable in metric_variables(run.result).items()}
+    found |= {name: getattr(run.result, name) for name in _OF_RUN} | {
+        "substeps": np.array(run.structure.substeps)
+    }
+    if run.loop is None:
+        return found
+    found |= {name: getattr(run.loop, field) for name, field in _OF_LOOP.items() if field}
+    wanted = tuple(name for name in names if name in ON_DEMAND)
+    one = jax.tree.map(lambda x: np.asarray(x)[None], run.case)
+    margin = np.array([run.loop.gain_margin])
+    more = judge_robustness(run.structure, one, wanted, margin)
+    return found | {name: value[0] for name, value in more.items()}

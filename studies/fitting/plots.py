@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,23 +25,21 @@ MOST, MOST_NUMBERS, MOST_SAMPLED = 8, 40, 6
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#999999"
 
 
-def all_figures(fitted: Fitted) -> Iterator[tuple[str, Figure]]:
-    """Names and figures."""
+def drawings(fitted: Fitted) -> dict[str, Callable[[], Figure]]:
+    """What draws each figure, by its name."""
     lines = [(_plain(x.title), x.part) for x in fitted.comparisons if isinstance(x.part, Line)]
     single = [(_plain(x.title), x.part) for x in fitted.comparisons if isinstance(x.part, Numbers)]
     diagrams = [(name, x.diagram) for name, x in single if x.diagram is not None]
-    if diagrams:
-        yield "stabilisation", stabilisation(diagrams[:MOST])
-    if lines:
-        yield "fit", curves(lines[:MOST])
-    if single:
-        yield "numbers", numbers(single)
-    if len(fitted.names) > 1:
-        yield "correlations", correlations(fitted)
-    if fitted.profiles:
-        yield "profiles", profiles(fitted)
-    if fitted.posterior is not None and len(fitted.names) > 1:
-        yield "samples", samples(fitted.posterior.values, fitted.names)
+    has_several, posterior = len(fitted.names) > 1, fitted.posterior
+    every = {
+        "stabilisation": diagrams and partial(stabilisation, diagrams[:MOST]),
+        "fit": lines and partial(curves, lines[:MOST]),
+        "numbers": single and partial(numbers, single),
+        "correlations": has_several and partial(correlations, fitted),
+        "profiles": fitted.profiles and partial(profiles, fitted),
+        "samples": has_several and posterior and partial(samples, posterior.values, fitted.names),
+    }
+    return {name: drawing for name, drawing in every.items() if callable(drawing)}
 
 
 def _plain(text: str) -> str:

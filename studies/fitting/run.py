@@ -19,8 +19,8 @@ from studies.fitting.report import is_good, report, sentences, summary, unknown_
 from studies.fitting.spec import FitSpec
 from studies.fitting.statistics import REGION
 from studies.publish import REPORT, announce, check_folder, publish
-from studies.show import figures
 from studies.show.document import json_text
+from studies.show.figures import draw
 from studies.store import Variable, write_store
 from studies.study.template import study_template
 from studies.threads import serial_blas
@@ -53,12 +53,10 @@ def run_fit(
         phases.begin("draw")
         images = [f"{x}.{kind}" for x in plots.NAMES for kind in ("png", "pdf")]
         with publish(out, [DOCUMENT, *images]) as staging:
-            with figures.styled():
-                for name, figure in plots.all_figures(fitted):
-                    figures.save(figure, staging, name, has_pdf)
             (staging / STUDY).write_text(study_template(fitted.study), encoding="utf-8")
             (staging / TUNE).write_text(_tuning(fitted), encoding="utf-8")
             write_store(staging / DATA, variables(fitted), run_attributes(fitted.study))
+            draw(staging, plots.drawings(fitted), has_pdf)
             (staging / REPORT).write_text(report(fitted, staging), encoding="utf-8")
         fitted = suggest(fitted, phases)
         with publish(out) as staging:  # only now is there a document: the answer is complete

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from threading import Event, Lock
 
@@ -41,7 +42,7 @@ from studies.laws.machines import machines_of, with_noise
 from studies.laws.report import document, report
 from studies.laws.tuning import Budget, Tuned, make_budget, tune_candidate
 from studies.publish import REPORT, publish
-from studies.show.figures import save, styled, write_figure
+from studies.show.figures import draw
 from studies.show.sketch import sketch
 from studies.space.spec import SweepSpec
 from studies.study.spec import Study
@@ -188,9 +189,8 @@ def _write(findings: LawFindings, out: Path) -> None:
             title = f"{findings.study.title or 'study'}: {controller.name}"[:200]
             named = controller.study.model_copy(update={"title": title})
             file.write_text(study_template(named), encoding="utf-8")
-        with styled():
-            save(plots.comparison(findings), staging, "laws")
-            save(plots.grid(findings), staging, "grid")
-            write_figure(sketch(findings.study), staging / "machine.png")
         (staging / DOCUMENT).write_text(document(findings), encoding="utf-8")
+        drawings = {"laws": plots.comparison, "grid": plots.grid}
+        draw(staging, {name: partial(plot, findings) for name, plot in drawings.items()})
+        draw(staging, {"machine": partial(sketch, findings.study)})
         (staging / REPORT).write_text(report(findings, staging), encoding="utf-8")

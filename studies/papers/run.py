@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -16,7 +17,7 @@ from studies.papers.card import CardResult, PaperCard
 from studies.papers.catalogue import find_card
 from studies.publish import REPORT, announce, check_folder, publish
 from studies.show.document import json_text
-from studies.show.figures import save, styled, write_figure
+from studies.show.figures import draw
 from studies.show.listing import Rows
 from studies.show.sketch import sketch
 from studies.store import write_store
@@ -76,12 +77,10 @@ def _write(
             _write_csv(staging / f"{name}.csv", rows)
         (staging / CLAIMS).write_text(json_text("paper", _document(card, result)), "utf-8")
         on_progress("writing data", 1.0)
-        for name, draw in result.figures.items():
+        for name, drawing in result.figures.items():
             on_progress(f"drawing {name}", DRAWING)
-            with styled():
-                save(draw(), staging, name, has_pdf)
-        with styled():
-            write_figure(sketch(result.study), staging / "machine.png")
+            draw(staging, {name: drawing}, has_pdf)
+        draw(staging, {"machine": partial(sketch, result.study)})
         (staging / REPORT).write_text(result.page(staging), encoding="utf-8")
 
 

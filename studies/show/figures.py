@@ -9,6 +9,8 @@ scrolls, where text of `SMALL` has 9.6 pixels: no figure has smaller text or is 
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from studies.publish import replacing
+from studies.errors import FigureWarning, StudyError
+from studies.publish import FAULT, replacing
 
 WITHOUT: dict[str, Any] = {"color": "#E69F00", "linewidth": 1.6, "label": "without control"}
 CONTROLLED: dict[str, Any] = {"color": "#0B3C6F", "linewidth": 0.8, "label": "with control"}
@@ -82,6 +85,24 @@ def legend_beside(ax: Axes, **style: Any) -> None:
     ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0, **style)
 
 
+def draw(folder: Path, drawings: Mapping[str, Callable[[], Figure]], has_pdf: bool = False) -> None:
+    """Write figures by name; one that cannot be drawn costs no result: its page says why.
+
+    Raises:
+        StudyError: a file cannot be written.
+    """
+    with styled():
+        for name, drawing in drawings.items():
+            try:
+                save(drawing(), folder, name, has_pdf)
+            except StudyError:
+                raise
+            except Exception as error:  # whatever Matplotlib makes of unforeseen numbers
+                text = f"The figure {name} could not be drawn: {error or type(error).__name__}."
+                warnings.warn(text, FigureWarning, stacklevel=2)
+                (folder / f"{name}{FAULT}").write_text(text, encoding="utf-8")
+
+
 def save(figure: Figure, folder: Path, name: str, has_pdf: bool = False) -> None:
     """Write the figure as PNG, and as PDF if wanted, whole or not at all.
 
@@ -101,7 +122,12 @@ def write_figure(figure: Figure, path: Path) -> None:
 
 
 def log_scale(ax: Axes, which: str) -> None:
-    """Make an axis, "x" or "y", logarithmic, with plain numbers, few enough to read."""
+    """Make an axis, "x" or "y", logarithmic, with plain numbers, few enough to read.
+
+    One without positive values stays as it is.
+    """
+    if not np.isfinite(getattr(ax.dataLim, f"minpos{which}")):
+        return
     ax.set(**{f"{which}scale": "log"})
     axis = ax.xaxis if which == "x" else ax.yaxis
     low, high = sorted(axis.get_view_interval())

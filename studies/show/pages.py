@@ -23,6 +23,7 @@ from markupsafe import Markup, escape
 
 from studies import config, passport
 from studies.errors import printable
+from studies.publish import FAULT
 from studies.show.units import count_text, headed, number, span
 from studies.study.entries import links_text
 from studies.study.labels import describe
@@ -173,6 +174,8 @@ def _verified(study: Study | None) -> dict[str, str]:
 def _image(folder: Path | None, file: str, caption: str) -> Markup:
     if folder is None:
         return Markup()
+    if (fault := (folder / file).with_suffix(FAULT)).is_file():
+        return Markup("<p>{}</p>").format(fault.read_text(encoding="utf-8"))
     if not (folder / file).is_file():
         raise ValueError(f"the report shows {file!r}, which is not among its images")
     return inline_image((folder / file).read_bytes(), caption)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -164,8 +165,8 @@ def _modes(run: Run) -> list[list[str]]:
     ]
 
 
-def draw(run: Run, twin: Run | None = None) -> dict[str, Figure]:
-    """Figures of a run, three rows each, in the style of the caller; twin: without control."""
+def drawings(run: Run, twin: Run | None = None) -> dict[str, Callable[[], Figure]]:
+    """What draws figures of a run, three rows each; twin: without control."""
     record = run.result.record
     assert record is not None
     pairs = [f"pair {k + 1}" for k in range(record.actuator_voltage.shape[2])]
@@ -176,9 +177,9 @@ def draw(run: Run, twin: Run | None = None) -> dict[str, Figure]:
         (f"link {i + 1} [V]", record.actuator_voltage[:, i]) for i in range(run.study.n_links)
     ]
     return {
-        "deflection": _deflection(run, twin),
-        "error": _over_time(run, error, []),
-        "voltage": _over_time(run, voltage, pairs),
+        "deflection": partial(_deflection, run, twin),
+        "error": partial(_over_time, run, error, []),
+        "voltage": partial(_over_time, run, voltage, pairs),
     }
 
 

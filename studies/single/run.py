@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from studies.engine.design import deviation, load_design
+from jaxmodel.metrics import METRICS
+from studies.engine.design import deviations, load_design
 from studies.engine.run_data import run_attributes, run_variables
 from studies.engine.runs import Run, run_study, uncontrolled_twin
 from studies.errors import StudyError
 from studies.publish import check_target, publish
+from studies.show.units import count_text
 from studies.store import write_store
 from studies.study.labels import describe
 from studies.study.spec import Study, load_study
@@ -20,29 +23,40 @@ FIGURES = ("deflection", "error", "voltage", "machine")
 
 
 class Replay(NamedTuple):
-    """A rerun case of a sweep, compared with the sweep's results."""
+    """A rerun case of a sweep, compared with all that the sweep has kept of it."""
 
     run: Run
     stored_status: int | None  # of the sweep; None if there is none
-    difference: float  # largest difference of a metric, relative to the metric's size [1]
-    metric: str  # which one; "" for none
+    differences: dict[str, tuple[float, float]]  # from `deviations`
 
     @property
     def agrees(self) -> bool:
-        """Whether the status is that of the sweep, if there is one."""
-        return self.stored_status in (None, self.run.status)
+        """Whether status and numbers are those of the sweep, if there is one."""
+        return self.stored_status in (None, self.run.status) and not self._faults
+
+    @property
+    def _faults(self) -> list[str]:
+        return [
+            f"CAUTION: {name} differs by {100 * found:.3g} %; allowed: {100 * allowed:g} %."
+            for name, (found, allowed) in self.differences.items()
+            if not found <= allowed
+        ]
 
     @property
     def notes(self) -> list[str]:
-        """The comparison as a sentence; [] if there is nothing to compare with."""
+        """The comparison in sentences; [] if there is nothing to compare with."""
         if self.stored_status is None:
             return []
-        which = f" ({self.metric})" if self.metric else ""
-        fault = [] if self.agrees else ["CAUTION: the sweep and this run end differently."]
+        is_same = self.stored_status == self.run.status
+        ends = [] if is_same else ["CAUTION: the sweep and this run end differently."]
+        metrics = {name: x for name, (x, _) in self.differences.items() if name in METRICS}
+        worst = max(metrics, key=metrics.__getitem__, default="")
         return [
-            *fault,
+            *ends,
+            *self._faults,
             f"the sweep has: {describe(self.stored_status)}; largest relative difference of a "
-            f"metric: {self.difference:.1e}{which}",
+            f"metric: {metrics.get(worst, 0.0):.1e}{f' ({worst})' if worst else ''}; compared: "
+            f"{count_text(len(self.differences), 'figure')}",
         ]
 
 
@@ -92,9 +106,9 @@ def replay(
     loaded = load_design(design, case)
     run = run_study(loaded.study)
     if loaded.stored:
-        again = Replay(run, int(loaded.stored["status"]), *deviation(run, loaded.stored))
+        again = Replay(run, int(loaded.stored["status"]), deviations(run, loaded.stored))
     else:
-        again = Replay(run, None, 0.0, "")
+        again = Replay(run, None, {})
     if file is not None:
         name = str(design) if case is None else f"{design} --case {case}"
         write_results(file, run, has_report, again.notes, name)
@@ -120,14 +134,13 @@ def write_results(
         write_store(staging / out.name, run_variables(run), run_attributes(run.study))
         if not has_report:
             return
-        from studies.show import figures
+        from studies.show.figures import draw
         from studies.show.sketch import sketch
-        from studies.single.report import draw, report
+        from studies.single.report import drawings, report
 
         twin = uncontrolled_twin(run)
-        with figures.styled():
-            for kind, figure in {**draw(run, twin), "machine": sketch(run.study)}.items():
-                figures.write_figure(figure, staging / f"{out.stem}-{kind}.png")
+        plots = drawings(run, twin) | {"machine": partial(sketch, run.study)}
+        draw(staging, {f"{out.stem}-{kind}": plot for kind, plot in plots.items()})
         text = report(out.stem, run, twin, notes, name, staging)
         (staging / f"{out.stem}.html").write_text(text, encoding="utf-8")
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from jaxmodel.beam import BASES
@@ -96,9 +100,9 @@ def spillover_design(
             console.print(residual, soft_wrap=True)
         phases.begin("draw")
         with publish(out) as staging:
-            _draw(staging, certificate, has_pdf)
             write_store(staging / DATA, variables(certificate), run_attributes(study))
             (staging / DOCUMENT).write_text(document(certificate), encoding="utf-8")
+            _draw(staging, certificate, has_pdf)
             (staging / REPORT).write_text(report(certificate, staging), encoding="utf-8")
     for note in (*certificate.notes, LEFT_OUT):
         console.print(note, soft_wrap=True)
@@ -138,15 +142,19 @@ def _with_fast_move(certificate: Certificate) -> Certificate:
 
 
 def _draw(folder: Path, certificate: Certificate, has_pdf: bool) -> None:
-    drawn = [("margins", plots.margins, 3.6), ("damping", plots.mode_damping, 2.65)]
-    with figures.styled():
-        for name, plot, height in drawn:
-            figure, axes = figures.new_figure(1, 1, height)
-            plot(certificate, axes[0, 0])
-            figures.save(figure, folder, name, has_pdf)
-        if LAWS[certificate.study.control.law].channel == "mode":
-            figures.save(plots.leakage(certificate), folder, "leakage", has_pdf)
-        figures.write_figure(sketch(certificate.study), folder / "machine.png")
+    def panel(plot: Callable[[Certificate, Axes], object], height: float) -> Figure:
+        figure, axes = figures.new_figure(1, 1, height)
+        plot(certificate, axes[0, 0])
+        return figure
+
+    drawings = {
+        "margins": partial(panel, plots.margins, 3.6),
+        "damping": partial(panel, plots.mode_damping, 2.65),
+    }
+    if LAWS[certificate.study.control.law].channel == "mode":
+        drawings["leakage"] = partial(plots.leakage, certificate)
+    figures.draw(folder, drawings, has_pdf)
+    figures.draw(folder, {"machine": partial(sketch, certificate.study)})
 
 
 def variables(certificate: Certificate) -> dict[str, Variable]:

@@ -17,6 +17,8 @@ from studies.tuning.spec import TuneSpec
 #: sample or link gets the largest voltage, another motion becomes the slowest. If a corner is even
 #: closer, second-order one-sided differences are right. The closest of the four counts.
 STEPS = (1e-3, 1e-4)
+#: Designs beside one whose derivative by a number is checked.
+MOVED = 4 * len(STEPS)
 #: Distance of the first design from the study, as a share of the way to another point. At the study
 #: itself, every limit "own" is reached in all scenarios at once: a corner by construction.
 BESIDE = 1 / 16
@@ -50,7 +52,9 @@ class Disagreement(NamedTuple):
     share: float  # disagreement as a share of the larger one
 
 
-def audit(spec: TuneSpec, places: np.ndarray | None = None) -> list[Disagreement]:
+def audit(
+    spec: TuneSpec, places: np.ndarray | None = None, most: int | None = None
+) -> list[Disagreement]:
     """Compare derivatives with finite differences; one entry per free parameter.
 
     Each number is checked in the family with the most free parameters among those that move it.
@@ -58,10 +62,12 @@ def audit(spec: TuneSpec, places: np.ndarray | None = None) -> list[Disagreement
     Args:
         spec: of the tuning.
         places: designs to check, as shares of the bounds, (n, p); None: `audit_places`.
+        most: designs that may be evaluated: so many numbers, drawn at random, are checked, one at
+            least; None: all.
     """
     worst: dict[int, Disagreement] = {}
     places = audit_places(spec) if places is None else places
-    for position, numbers in _cover_numbers(spec).items():
+    for position, numbers in _sampled(spec, len(places), most).items():
         # as many designs as the tuning has starts, to share its program
         evaluator = Evaluator(spec, [spec.moving[position]] * len(start_families(spec)))
         slopes_by_place, exact = [], []
@@ -95,6 +101,21 @@ def _cover_numbers(spec: TuneSpec) -> dict[int, list[int]]:
         checks[best] = [int(k) for k in np.flatnonzero(spec.moving[best].is_free & left)]
         left = left & ~spec.moving[best].is_free
     return checks
+
+
+def _sampled(spec: TuneSpec, n_places: int, most: int | None) -> dict[int, list[int]]:
+    """Of `_cover_numbers`, what so many evaluations allow."""
+    checks = _cover_numbers(spec)
+    if most is None:
+        return checks
+    random, left = np.random.default_rng(spec.tune.seed), most // n_places
+    drawn: dict[int, list[int]] = {}
+    for position, numbers in checks.items():
+        count = min(len(numbers), max((left - 1) // MOVED, 0 if drawn else 1))
+        if count:
+            drawn[position] = sorted(random.permutation(numbers)[:count].tolist())
+            left -= 1 + MOVED * count
+    return drawn
 
 
 def _compare(

@@ -14,7 +14,9 @@ import numpy as np
 from studies.engine.folder import TUNING, TUNINGS, locked_folder, refuse_existing
 from studies.errors import StudyError
 from studies.publish import check_target, replacing
-from studies.reading import read_json, read_npz
+from studies.reading import read_bytes, read_json, read_npz
+from studies.study.spec import Study
+from studies.study.template import is_edited, signed, study_template
 from studies.tuning.optimise import Progress
 
 MANIFEST, PROGRESS, RESULTS = TUNING, "progress.npz", "tune.h5"
@@ -44,6 +46,7 @@ def open_tuning(out: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterat
                         f"--out {out}: was begun with another {what}; name a new folder"
                     )
             before = load_progress(out / PROGRESS)
+            _refuse_edited(out)
         for left in out.iterdir():  # only once their owner is known
             if TUNINGS.leftover.fullmatch(left.name) and left.is_file():
                 left.unlink()
@@ -56,6 +59,35 @@ def open_tuning(out: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterat
             if not (out / PROGRESS).exists():  # nothing to continue, so a corrected file can start
                 path.unlink(missing_ok=True)
             raise
+
+
+def write_designs(out: Path, designs: dict[str, Study], written: dict[str, str]) -> dict[str, str]:
+    """Write study files that differ from those written before.
+
+    Args:
+        out: the folder.
+        designs: by the names of their files.
+        written: texts of the files as they are, but for their titles.
+
+    Returns:
+        The same for `designs`.
+    """
+    texts = {name: study_template(study.change(title="")) for name, study in designs.items()}
+    for name, text in texts.items():
+        if written.get(name) != text:
+            with replacing(out / name) as temporary:
+                temporary.write_text(signed(study_template(designs[name])), encoding="utf-8")
+    return texts
+
+
+def _refuse_edited(out: Path) -> None:
+    """Raise StudyError if resuming would overwrite what somebody has edited."""
+    for path in sorted(out.glob("tuned*.toml")):
+        if is_edited(read_bytes(path).decode(errors="replace")):
+            raise StudyError(
+                f"{path}: edited since the tuning has written it; --resume would overwrite it: "
+                "move it to another folder"
+            )
 
 
 def _fixed_part(part: Any) -> Any:

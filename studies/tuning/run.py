@@ -1,6 +1,7 @@
-"""A tuning in its folder: `tune.json` (the request), `progress.npz` (progress), `tune.h5` (every
-start), `study.toml` (the reference), `tuned.toml` (the study with the best numbers, one file per
-family), the report (`report.html`) and its figures.
+"""A tuning in its folder: `tune.json` (the request), `progress.npz` (the descent), `phases.npz`
+(what followed it), `tune.h5` (every start), `study.toml` (the reference), `tuned.toml` (the study
+with the best numbers, one file per family, from the first better design on), the report
+(`report.html`) and its figures.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import json
 import time
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -19,16 +21,18 @@ from studies.engine.progress import Phases, duration_text
 from studies.engine.run_data import run_attributes
 from studies.errors import StudyError
 from studies.publish import REPORT, publish
-from studies.show.figures import save, styled, write_figure
+from studies.show.figures import draw
 from studies.show.sketch import sketch
 from studies.store import write_store
-from studies.study.template import study_template
+from studies.study.spec import Study
+from studies.study.template import signed, study_template
 from studies.tuning import plots
-from studies.tuning.audit import audit
-from studies.tuning.check import search, tuned_study
+from studies.tuning.audit import Disagreement, audit
+from studies.tuning.check import RandomSearch, search, tuned_study
 from studies.tuning.evaluate import Evaluator
-from studies.tuning.folder import PROGRESS, RESULTS, open_tuning, save_progress
+from studies.tuning.folder import PROGRESS, RESULTS, open_tuning, save_progress, write_designs
 from studies.tuning.optimise import Progress, is_compatible, optimise, start_families
+from studies.tuning.phases import KeptPhases
 from studies.tuning.references import compare
 from studies.tuning.report import (
     TuneFindings,
@@ -43,6 +47,8 @@ from studies.tuning.results import variables
 from studies.tuning.spec import TuneSpec
 
 #: Modules that determine the numbers of a tuning, with everything they import.
+#: Share of the evaluations of a descent that the comparison of its derivatives takes.
+SHARE = 0.1
 DECISIVE = ("studies.tuning.check", "studies.tuning.evaluate", "studies.tuning.optimise")
 
 
@@ -111,8 +117,11 @@ def _tune(
     phases.begin("compile", "starting points by the linear loop, and the first iteration")
     evaluator, clock = evaluator or make_evaluator(spec), _Clock()
 
+    written: dict[str, str] = {}
+
     def keep(at: Progress) -> None:
         save_progress(out / PROGRESS, at)
+        written.update(write_designs(out, tuned_studies(spec, at, is_over=False), written))
         if phases.present == "compile":  # the first iteration compiles
             phases.begin("descend")
         done, total = int(at.iteration), spec.tune.iterations
@@ -126,7 +135,7 @@ def _tune(
             "with the family's settings should be one that does (try studies simulate)"
         )
     phases.say(ended(spec, at))
-    findings = find(spec, evaluator, at, phases)
+    findings = find(spec, evaluator, at, phases, KeptPhases(out, at))
     phases.begin("draw")
     _write(spec, findings, out)
     for line in summary(spec, findings):
@@ -169,7 +178,9 @@ def _progress_text(spec: TuneSpec, at: Progress) -> str:
     )
 
 
-def find(spec: TuneSpec, evaluator: Evaluator, at: Progress, phases: Phases) -> TuneFindings:
+def find(
+    spec: TuneSpec, evaluator: Evaluator, at: Progress, phases: Phases, kept: KeptPhases
+) -> TuneFindings:
     """Judge the result of a tuning.
 
     Args:
@@ -177,7 +188,31 @@ def find(spec: TuneSpec, evaluator: Evaluator, at: Progress, phases: Phases) -> 
         evaluator: of its starting points.
         at: where the tuning ended.
         phases: those of `tune_phases`.
+        kept: what phases have found before.
     """
+    main = int(np.flatnonzero(at.family == spec.main)[0])
+
+    def searched() -> RandomSearch:
+        phases.begin("random designs", f"{spec.tune.samples} for comparison")
+        return search(spec, evaluator.linear, main)
+
+    def audited() -> list[Disagreement]:
+        phases.begin("compare derivatives", "with differences")
+        most = max(1, int(SHARE * at.iteration)) * len(at.family)
+        return audit(spec, at.best_place[[at.winner(spec.main)]], most)
+
+    return TuneFindings(
+        spec=spec,
+        at=at,
+        **kept.find("check", lambda: _checked(spec, evaluator, at, phases)),
+        searched=kept.find("random designs", searched) if spec.tune.samples else None,
+        audited=kept.find("compare derivatives", audited),
+        runs=int(at.iteration) * evaluator.lanes,
+    )
+
+
+def _checked(spec: TuneSpec, evaluator: Evaluator, at: Progress, phases: Phases) -> dict[str, Any]:
+    """The best designs on fresh machines, and by the linear loop."""
     values = spec.free.values(at.best_place)
     winners = [at.winner(k) for k in range(len(spec.moving))]
     designs = [spec.study] + [
@@ -185,7 +220,6 @@ def find(spec: TuneSpec, evaluator: Evaluator, at: Progress, phases: Phases) -> 
         for k, family in enumerate(spec.families)
     ]
     baseline, judged, references = compare(spec, designs, partial(phases.begin, "check"))
-    main = int(np.flatnonzero(at.family == spec.main)[0])
     linear = np.concatenate(
         [
             evaluator.linear.screen(
@@ -198,47 +232,50 @@ def find(spec: TuneSpec, evaluator: Evaluator, at: Progress, phases: Phases) -> 
     last = evaluator.evaluate(values)
     if np.isnan(evaluator.run_time):  # the last batch compiled
         evaluator.evaluate(values)
-    searched = None
-    if spec.tune.samples:
-        phases.begin("random designs", f"{spec.tune.samples} for comparison")
-        searched = search(spec, evaluator.linear, main)
-    best = at.best_place[at.winner(spec.main)]
-    phases.begin("compare derivatives", "with differences")
-    audited = audit(spec, np.stack([(spec.free.places() + best) / 2, best]))
-    return TuneFindings(
-        spec=spec,
-        at=at,
-        baseline=baseline,
-        judged=judged,
-        audited=audited,
-        linear=linear,
-        residual=last.residual,
-        searched=searched,
-        run_time=evaluator.run_time,
-        runs=int(at.iteration) * evaluator.lanes,
-        references=references,
-    )
+    return {
+        "baseline": baseline,
+        "judged": judged,
+        "references": references,
+        "linear": linear,
+        "residual": last.residual,
+        "run_time": evaluator.run_time,
+    }
+
+
+def tuned_studies(spec: TuneSpec, at: Progress, is_over: bool = True) -> dict[str, Study]:
+    """The reference, and the best design of each family that has one, by the names of their files.
+
+    Args:
+        spec: of the tuning.
+        at: its progress.
+        is_over: whether the descent has ended, which the titles say.
+    """
+    studies = {"study.toml": spec.study}
+    state = "" if is_over else f" (best so far, of {int(at.iteration)} iterations, not checked)"
+    for k, family in enumerate(spec.moving):
+        if _has_finished(at, k):
+            tuned = tuned_study(spec, family, spec.free.values(at.best_place[at.winner(k)]))
+            title = f"{spec.study.title or 'study'}, tuned: {family.name}"[: 200 - len(state)]
+            name = file_name(spec, family)
+            studies[name] = tuned.model_copy(update={"title": f"{title}{state}"})
+    return studies
 
 
 def _write(spec: TuneSpec, findings: TuneFindings, out: Path) -> None:
-    at = findings.at
-    studies = {"study.toml": spec.study}
-    for k, family in enumerate(spec.moving):
-        values = spec.free.values(at.best_place[at.winner(k)])
-        tuned = tuned_study(spec, family, values)
-        title = f"{spec.study.title or 'study'}, tuned: {family.name}"
-        studies[file_name(spec, family)] = tuned.model_copy(update={"title": title})
+    studies = tuned_studies(spec, findings.at)
     attributes = run_attributes(spec.study) | {"tuning": json.dumps(spec.data)}
     best = spec.moving[best_family(spec, findings)]
     with publish(out) as staging:
         for name, study in studies.items():
-            (staging / name).write_text(study_template(study), encoding="utf-8")
+            (staging / name).write_text(signed(study_template(study)), encoding="utf-8")
         write_store(staging / RESULTS, variables(spec, findings), attributes)
-        with styled():
-            write_figure(sketch(studies[file_name(spec, best)]), staging / "machine.png")
-        save(plots.descent(spec, findings), staging, "descent")
-        save(plots.gains(spec, findings), staging, "gains")
+        drawings = {
+            "machine": partial(sketch, studies[file_name(spec, best)]),
+            "descent": partial(plots.descent, spec, findings),
+            "gains": partial(plots.gains, spec, findings),
+        }
         for limit in spec.metric_limits[:1]:
-            front = plots.front(spec, findings, spec.tune.pareto.get("limit", limit))
-            save(front, staging, "front")
+            along = spec.tune.pareto.get("limit", limit)
+            drawings["front"] = partial(plots.front, spec, findings, along)
+        draw(staging, drawings)
         (staging / REPORT).write_text(report(spec, findings, str(out), staging), encoding="utf-8")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -10,8 +11,8 @@ from studies.engine.design import Design, as_design
 from studies.engine.progress import Phases
 from studies.engine.runs import resolved_study
 from studies.publish import REPORT, announce, check_folder, publish
-from studies.show import figures
 from studies.show.document import json_text
+from studies.show.figures import draw
 from studies.study.spec import Study
 from studies.twin.compare import BothRuns, TwinBench, causes, check_supported, our_runs, pair
 from studies.twin.law import check_compiler

@@ -6,7 +6,7 @@ import pytest
 from studies.errors import StudyError
 from studies.fitting.decays import DecaySettings, decay_modes
 from studies.fitting.estimate import estimate
-from studies.fitting.plots import all_figures
+from studies.fitting.plots import drawings
 from tests.fits import (
     ASKEW,
     DECAY,
@@ -185,7 +185,7 @@ def test_a_fit_to_decays_finds_the_machine(shaken):
     part = fitted.comparisons[0].part
     assert fitted.answer.is_explained and len(part.labels) == 12
     assert all("shape" in note for note in part.notes)
-    assert "stabilisation" in dict(all_figures(fitted))
+    assert "stabilisation" in drawings(fitted)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from studies.fitting.estimate import estimate, fit
 from studies.fitting.kinds.contract import Line
 from studies.fitting.kinds.modes import TWO_PI, pair_modes
 from studies.fitting.measurements import make_bench
-from studies.fitting.plots import all_figures, curves, samples
+from studies.fitting.plots import curves, drawings, samples
 from studies.fitting.posterior import log_density, sample, shape
 from studies.fitting.problem import check_sanity, make_problem
 from studies.fitting.profiles import profile
@@ -364,8 +364,8 @@ def test_an_optimum_at_a_bound(folder):
     places = found.posterior.places
     assert places.shape == (20, 1) and np.all((places > 0) & (places < 1))
     assert found.posterior.effective.shape == (1,)
-    drawn = dict(all_figures(found))
-    drawn["profiles"].canvas.draw()
+    drawn = drawings(found)
+    drawn["profiles"]().canvas.draw()
     assert "samples" not in drawn  # against which other number?
 
 
@@ -672,7 +672,7 @@ def test_samples_of_two_numbers_are_drawn():
         profiles=[],
         posterior=SimpleNamespace(values=np.random.default_rng(0).normal(size=(50, 2))),
     )
-    assert list(dict(all_figures(fitted))) == ["correlations", "samples"]
+    assert list(drawings(fitted)) == ["correlations", "samples"]
 
 
 def test_folders_that_cannot_be_are_refused_before_the_work(tmp_path):

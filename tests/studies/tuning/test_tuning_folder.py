@@ -283,7 +283,11 @@ def loud_and_calm():
     """A tuning whose better family exceeds its limit; results of it that no run has given."""
     spec = tuning(GAIN, starts=1, limits={"peak_voltage": 30.0}, families={"loud": {}, "calm": {}})
     at = begin(spec, SimpleNamespace(linear=None))
-    at = at._replace(best_limits=np.array([[0.1], [0.0]]), best_place=np.array([[0.9], [0.2]]))
+    at = at._replace(
+        best_limits=np.array([[0.1], [0.0]]),
+        best_place=np.array([[0.9], [0.2]]),
+        best_objective=np.array([0.5, 0.8]),
+    )
     judged = [SimpleNamespace(objective=np.array([share])) for share in (0.5, 0.8)]
     return spec, SimpleNamespace(at=at, judged=judged)
 
@@ -300,9 +304,10 @@ def test_the_machine_shown_is_the_recommended_one(tmp_path):
         "variables": lambda *_: {},
         "report": lambda *_: "",
     }
-    drawn = dict.fromkeys(("plots", "save", "write_figure"), mock.Mock())
-    with mock.patch.multiple(tuning_run, sketch=shown, **made_up, **drawn):
+    draw = mock.Mock()
+    with mock.patch.multiple(tuning_run, sketch=shown, draw=draw, plots=mock.Mock(), **made_up):
         tuning_run._write(spec, found, tmp_path / "out")
+    draw.call_args[0][1]["machine"]()
     (study,), _ = shown.call_args
     loud, calm = spec.free.values(found.at.best_place)[:, 0]
     assert study.control.gain_factor == calm != loud
