@@ -34,7 +34,7 @@ from .study.template import write_study
 from .sweeps.plots import plot
 from .sweeps.report import write_sweep_report
 from .sweeps.sensitivity import analyse
-from .sweeps.show import best_cases, status_rows
+from .sweeps.show import best_cases, table
 from .tuning.audit import audit
 from .tuning.run import run_tuning
 from .tuning.spec import load_tuning, parse_tuning
@@ -93,7 +93,7 @@ __all__ = [
     "screen_of",
     "simulate",
     "spillover_design",
-    "status_rows",
+    "table",
     "twin_design",
     "verify_study",
     "write_study",

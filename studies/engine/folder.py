@@ -497,10 +497,11 @@ def finished_cases(path: Path, place: str = CHUNKS) -> Finished:
         sources.append(np.full(is_run.sum(), len(kept)))
         kept.append(file)
     if not ids:
-        return Finished(np.empty(0, "S16"), np.empty(0, int), np.empty(0, int), [], damaged)
+        none = np.empty(0, int)
+        return Finished(np.empty(0, "S16"), file=none, row=none, files=[], damaged=damaged)
     case_id, first = np.unique(np.concatenate(ids), return_index=True)
-    places = np.concatenate(sources)[first], np.concatenate(rows)[first]
-    return Finished(case_id, *places, kept, damaged)
+    number, row = np.concatenate(sources)[first], np.concatenate(rows)[first]
+    return Finished(case_id, file=number, row=row, files=kept, damaged=damaged)
 
 
 def _check_columns(store: h5py.File, count: int) -> None:

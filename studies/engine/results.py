@@ -160,13 +160,15 @@ def _not_shown(folder: Path, table: CaseTable, finished: Finished) -> Iterator[s
             "or other axes than the one that ran them. They are not shown."
         )
     if finished.damaged:
-        names = ", ".join(chunk.name for chunk in finished.damaged[:3])
+        names = ", ".join(chunk.name for chunk in finished.damaged[:NAMED])
         yield (
             f"{len(finished.damaged):,} of the files in {folder / CHUNKS} are damaged ({names}): "
             "their cases count as not run yet, and run again with --resume."
         )
 
 
+#: Damaged files that a note names.
+NAMED = 3
 #: Axes of what the baseline's file holds beside metrics.
 BASELINE_DIMS: dict[str, tuple[str, ...]] = {"status": (), "adc_step": ("link",)}
 

@@ -47,16 +47,16 @@ class Round(NamedTuple):
         return np.union1d(self.first, self.audit)
 
 
-def check_screen_names(spec: SweepSpec, table: CaseTable) -> None:
-    """Reject a screen that ranks by or asks for what no case has, before anything runs.
+def check_names(spec: SweepSpec, table: CaseTable) -> None:
+    """Reject a sweep or screen that ranks by or asks for what no case has, before anything runs.
 
     Raises:
         StudyError: so it does.
     """
+    metrics, sizes = kept_metrics(spec), metric_sizes(table)
+    parse_entries(spec.sweep.by, "sweep.by", sizes)
     if spec.screen is None:
         return
-    metrics = kept_metrics(spec)
-    sizes = metric_sizes(table)
     parse_entries(spec.screen.entry, "sweep.screen.by", sizes)
 
     def lookup(name: str) -> np.ndarray:

@@ -33,7 +33,7 @@ from studies.engine.progress import Phases, Reporter
 from studies.engine.results import links_of
 from studies.engine.screen import (
     Round,
-    check_screen_names,
+    check_names,
     first_round,
     full_runs,
     next_round,
@@ -94,9 +94,8 @@ def make_plan(spec: SweepSpec, out: Path | None = None) -> Plan:
         StudyError: a fault of the sweep, or a folder with a different sweep.
     """
     config.require_configured()
-    kept_metrics(spec)
     table, sweep = build_table(spec), spec.sweep
-    check_screen_names(spec, table)
+    check_names(spec, table)
     rows = np.arange(len(table))
     if out is not None:
         before, _ = _joined(out, spec, table, make_manifest(spec.data))
@@ -145,9 +144,8 @@ def run_sweep(
     say = partial(phases.console.print, soft_wrap=True)
     manifest = make_manifest(spec.data)
     with open_folder(out, manifest, is_resumed) as folder, interrupts() as stop:
-        kept_metrics(spec)
         table = build_table(spec)
-        check_screen_names(spec, table)
+        check_names(spec, table)
         before, screened_before = _joined(out, spec, table, manifest)
         folder.begin(manifest, (*before.damaged, *screened_before.damaged), say)
         run = _Run(spec, table, folder, runner, phases, stop)

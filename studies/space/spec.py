@@ -21,7 +21,7 @@ from studies.errors import StudyError, field_error, nearest
 from studies.reading import check_depth
 from studies.space.methods import METHODS
 from studies.study.choices import OWN, OneOf
-from studies.study.entries import parse_entries
+from studies.study.entries import entry_sizes, parse_entries
 from studies.study.explain import explain
 from studies.study.files import read_toml
 from studies.study.spec import Section, Study, described, parse_study
@@ -144,7 +144,7 @@ def parse_sweep(data: dict[str, Any]) -> SweepSpec:
     )
     sweep = _parse_block(Sweep, data["sweep"], "sweep")
     assert isinstance(sweep, Sweep)
-    ranking = parse_entries(sweep.by, "sweep.by").metric
+    ranking = parse_entries(sweep.by, "sweep.by", _known_sizes(study)).metric
     if "by" in data["sweep"] and sweep.metrics and ranking not in sweep.metrics:
         raise field_error("sweep.by", sweep.by, f"one of sweep.metrics = {list(sweep.metrics)}")
     known = range(1, study.n_links + 1)
@@ -158,16 +158,22 @@ def parse_sweep(data: dict[str, Any]) -> SweepSpec:
             raise field_error("sweep.robustness", name, ", ".join((*MARGINS, *PEAKS)), hint=hint)
         if sweep.robustness.count(name) > 1:
             raise field_error("sweep.robustness", name, "each figure once")
-    screen = _parse_screen(sweep) if "screen" in data["sweep"] else None
+    screen = _parse_screen(sweep, study) if "screen" in data["sweep"] else None
     return SweepSpec(study=study, sweep=sweep, root=_node(sweep, "sweep"), screen=screen, data=data)
 
 
-def _parse_screen(sweep: Sweep) -> Screen:
+def _known_sizes(study: Study) -> dict[str, int]:
+    """Lengths of the axes of metrics that are the same in every case."""
+    sizes = entry_sizes(study)
+    return {axis: sizes[axis] for axis in ("link", "pose_axis")}
+
+
+def _parse_screen(sweep: Sweep, study: Study) -> Screen:
     try:
         screen = Screen.model_validate(sweep.screen)
     except ValidationError as error:
         raise explain(error, Screen, sweep.screen, inside="sweep.screen") from None
-    ranking = parse_entries(screen.entry, "sweep.screen.by").metric
+    ranking = parse_entries(screen.entry, "sweep.screen.by", _known_sizes(study)).metric
     if sweep.metrics and ranking not in sweep.metrics:
         allowed = f"one of sweep.metrics = {list(sweep.metrics)}"
         raise field_error("sweep.screen.by", screen.by, allowed)

@@ -61,7 +61,7 @@ def parse_entries(name: str, path: str = "", sizes: Mapping[str, int] | None = N
     Args:
         name: of a metric, perhaps with indices.
         path: where it is written, for messages.
-        sizes: of axes, for checking indices; None: they are not checked.
+        sizes: of axes, for checking indices; those that are missing are not checked.
 
     Raises:
         StudyError: no such metric, axis or entry.
@@ -73,20 +73,24 @@ def parse_entries(name: str, path: str = "", sizes: Mapping[str, int] | None = N
         suggestion = f"did you mean {hint!r}?" if hint else f"allowed: {', '.join(METRICS)}"
         raise StudyError(f"{where}{name!r}: unknown metric; {suggestion}")
     axes = METRICS[plain.field].dims
-    size = {axis: sizes[axis] if sizes else sys.maxsize for axis in axes}
+    size = {axis: (sizes or {}).get(axis, sys.maxsize) for axis in axes}
     at: dict[str, int] = {}
     for axis, written in NAMED_INDEX.findall(name):
         if axis not in axes or axis in at or not 1 <= int(written) <= size[axis]:
-            allowed = ", ".join(f"[{one}=1 to {n}]" for one, n in size.items()) or "no index"
+            allowed = ", ".join(f"[{x}={_span(1, n)}]" for x, n in size.items()) or "no index"
             raise StudyError(f"{where}{name!r} has no such entry; allowed: {allowed}")
         at[axis] = int(written) - 1
     left = [axis for axis in axes if axis not in at]
     at |= dict(zip(left, plain.indices, strict=False))
     is_inside = all(number < size[axis] for axis, number in at.items())
     if len(plain.indices) > len(left) or not is_inside:
-        shape = "".join(f"[0 to {n - 1}]" for n in size.values())
+        shape = "".join(f"[{_span(0, n - 1)}]" for n in size.values())
         raise StudyError(f"{where}{name!r} has no such entry; allowed: {plain.field}{shape}")
     return Entries(plain.field, tuple(at.get(axis) for axis in axes))
+
+
+def _span(first: int, last: int) -> str:
+    return f"{first} to {last}" if last < sys.maxsize - 1 else f"{first} or more"
 
 
 def entry_sizes(study: Study) -> dict[str, int]:

@@ -237,7 +237,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         print_uncontrolled(data, name, console)
         if agreed:
             console.print(agreed, soft_wrap=True)
-        console.print(f"by {name}, {direction(by)} first, {counted_text(data, name)}:")
+        counted = counted_text(data, name)
+        console.print(
+            ", ".join(filter(None, (f"by {name}", f"{direction(by)} first", counted))) + ":"
+        )
         print_cases(data, cases, [name], console)
         print_left_out(data, console)
         if breaks:

@@ -80,8 +80,11 @@ def environments_text(data: SweepData) -> str:
         return ""
     count = np.bincount(data.designs)
     number = f"{count.max()}" if count.min() == count.max() else f"{count.min()} to {count.max()}"
-    names = ", ".join(data.spec.sweep.environments)
+    names, repeats = ", ".join(data.spec.sweep.environments), data.spec.sweep.repeats
+    what = f"environments ({names})"
+    if repeats > 1:  # each of its cases is one of both
+        what = f"cases, environments ({names}) times {repeats} repeats"
     return (
         f"{count_text(len(count), 'design')}, each by the {over_text(data)} of its {number} "
-        f"environments ({names}); the case shown is the one nearest to that"
+        f"{what}; the case shown is the one nearest to that"
     )

@@ -13,6 +13,7 @@ from rich.markup import escape
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
+from studies.engine.columns import ON_DEMAND, PER_CASE
 from studies.engine.results import (
     ROUNDING,
     SweepData,
@@ -25,7 +26,6 @@ from studies.engine.results import (
     swept_names,
     uncontrolled_value,
 )
-from studies.engine.stored import kept_metrics
 from studies.errors import ResolutionWarning, StudyError, field_error
 from studies.show.listing import Rows, print_rows
 from studies.show.units import count_text, headed, readable, settling_text
@@ -108,8 +108,6 @@ def best_cases(
     Raises:
         StudyError: an argument that is none, unknown metric, or no case left.
     """
-    import pandas
-
     for field, text in (("by", by), ("subject_to", subject_to)):
         if not isinstance(text, str):
             raise field_error(field, text, "a text")
@@ -120,10 +118,42 @@ def best_cases(
     text = resolution_warning(data, cases, name)
     if text:
         warnings.warn(text, ResolutionWarning, stacklevel=2)
-    columns = {"case_id": data["case_id"], **dict(scalar_columns(data))}
-    columns |= {metric: design_values(data, metric) for metric in with_others(data, [name])}
-    table = {key: column[cases] for key, column in columns.items()}
-    return pandas.DataFrame(table, index=pandas.Index(cases, name="case"))
+    return _frame(data, {x: design_values(data, x) for x in with_others(data, [name])}, cases)
+
+
+def table(sweep: SweepData | str | Path) -> pandas.DataFrame:
+    """All cases of a sweep, a row each.
+
+    For example `table("gains").plot.scatter("control.gain_factor", "residual_rms")`, or
+    `table("gains").status.value_counts()`.
+
+    Args:
+        sweep: its folder, or its data as read.
+
+    Returns:
+        By the number of the case: its id, what varies (of a list, such as a placement, a column per
+        entry), how it ended in words, and each metric, margin and damping ratio that was kept, the
+        worst over links, stations and modes, in SI units under their names in the sweep file.
+
+    Raises:
+        StudyError: no sweep there, a damaged file, or results of another version.
+    """
+    data = as_sweep(sweep)
+    codes, which = np.unique(data["status"], return_inverse=True)
+    words = np.array([reason(code) for code in codes.tolist()])[which]
+    kept = [x for x in (MARGIN, "damping_ratio", *ON_DEMAND, *METRICS) if x in data.variables]
+    varied = {"repeat": data["repeat"]} if data["repeat"].any() else {}
+    values = {name: metric_values(data, name) for name in kept}
+    return _frame(data, varied | {"status": words} | values, np.arange(data.n_cases))
+
+
+def _frame(data: SweepData, columns: dict[str, np.ndarray], cases: np.ndarray) -> pandas.DataFrame:
+    """Some cases with what varies, and these columns of all cases."""
+    import pandas
+
+    columns = {"case_id": data["case_id"], **dict(scalar_columns(data))} | columns
+    rows = {name: column[cases] for name, column in columns.items()}
+    return pandas.DataFrame(rows, index=pandas.Index(cases, name="case"))
 
 
 def ranked_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10) -> np.ndarray:
@@ -168,9 +198,8 @@ def show(data: SweepData, console: Console, is_failed: bool) -> None:
         print_cases(data, best, [by], console)
 
 
-def status_rows(sweep: SweepData | str | Path) -> Rows:
-    """Number of cases by status; of a folder, or of its data as read."""
-    data = as_sweep(sweep)
+def status_rows(data: SweepData) -> Rows:
+    """Number of cases by status."""
     rows = [
         [x["status_text"], str(x["cases"]), f"{100 * x['cases'] / data.n_cases:.1f}"]
         for x in status_records(data)
@@ -361,13 +390,16 @@ def label(data: SweepData, name: str) -> str:
 
 def ranking(data: SweepData) -> str:
     """What ranks the cases: the sweep's choice, or the first metric it keeps."""
-    by = data.spec.sweep.by
-    return by if by.partition("[")[0] in data.variables else kept_metrics(data.spec)[0]
+    sweep = data.spec.sweep
+    is_kept = sweep.by.partition("[")[0] in data.variables
+    return sweep.by if is_kept else (sweep.metrics or tuple(METRICS))[0]
 
 
 def counted_text(data: SweepData, by: str) -> str:
-    """What a metric's largest value is taken over, in words."""
+    """What a metric's largest value is taken over, in words; "" for what is no metric."""
     metric = by.partition("[")[0]
+    if metric not in (*METRICS, *PER_CASE):
+        return ""
     if metric not in data.variables:
         return "of no case"
     axes = list(data.variables[metric].dims[1:])

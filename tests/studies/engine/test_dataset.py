@@ -11,10 +11,11 @@ import xarray
 import studies
 from campaigns.mutations import sweep_folder
 from jaxmodel import status
+from jaxmodel.metrics import METRICS
 from studies.engine.dataset import as_dataset
-from studies.engine.results import _worst, read_sweep
+from studies.engine.results import _worst, metric_values, read_sweep
 from studies.errors import StudyError
-from studies.sweeps.show import best_cases
+from studies.sweeps.show import best_cases, table
 from tests.studies.sweeps.test_sweep_tables import GAINS, made_up, of_links, usual
 
 GAIN, MODES = "control.gain_factor", "control.modes"
@@ -48,14 +49,26 @@ def test_links_and_modes_count_from_one_and_carry_units(folders):
     assert one.item() == values
 
 
-def test_tables_have_a_column_per_name(folders):
-    frame = studies.load(folders[0])[["gain_margin", "status_text"]].to_dataframe()
-    assert frame.index.names == [GAIN, MODES] and len(frame) == 6
-    margins = read_sweep(folders[0])["gain_margin"]
-    assert frame.loc[(0.5, 2), "gain_margin"] == margins[3]
-    assert set(frame.status_text) == {"ok"} and frame.case.tolist() == list(range(6))
-    whole = studies.load(folders[0]).residual_rms.to_dataframe().reset_index()
-    assert {GAIN, MODES, "link", "station", "residual_rms", "case_id"} <= set(whole.columns)
+def test_a_table_has_a_row_per_case_and_a_column_per_name(folders):
+    frame, data = studies.table(folders[0]), read_sweep(folders[0])
+    assert frame.index.tolist() == list(range(6)) and frame.index.name == "case"
+    assert set(METRICS) | {"case_id", GAIN, MODES, "status", "gain_margin"} <= set(frame.columns)
+    np.testing.assert_array_equal(frame.residual_rms, metric_values(data, "residual_rms"))
+    assert frame.loc[3, "gain_margin"] == data["gain_margin"][3]
+    assert frame[[GAIN, MODES]].to_numpy().tolist()[3] == [0.5, 2]
+    part = studies.table(folders[1])
+    assert part.status.value_counts().to_dict() == {"ok": 4, "not run yet": 2}
+    assert part.residual_rms.isna().sum() == 2
+
+
+def test_a_table_has_a_column_per_entry_of_a_placement():
+    """Of many cases, too: all at once took 322 million rows."""
+    axes = {"placement": {"kind": "mirrored"}}
+    data = made_up({"method": "sobol", "count": 16, "axes": axes, "repeats": 2})
+    frame = table(data)
+    names = [x for x in frame.columns if x.startswith("patches.centers[")]
+    assert len(frame) == 32 and len(names) >= 3 and set(frame["repeat"]) == {0, 1}
+    np.testing.assert_array_equal(frame[names], data["patches.centers"].reshape(32, -1))
 
 
 def test_an_unfinished_sweep_says_so_in_words(folders):
@@ -142,7 +155,7 @@ def test_functions_of_sweeps_take_their_folder(folders):
     frame = studies.best_cases(folders[0], "residual_rms", count=3)
     values = read_sweep(folders[0])["residual_rms"].reshape(6, -1).max(axis=1)
     assert frame.index.tolist() == np.argsort(values)[:3].tolist()
-    assert studies.status_rows(str(folders[0])).rows == [["ok", "6", "100.0"]]
+    assert set(studies.table(str(folders[0])).status) == {"ok"}
     assert studies.plot(folders[0], x="gain", y="residual_rms").axes
 
 

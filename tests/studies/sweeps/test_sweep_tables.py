@@ -1,6 +1,7 @@
 """Tables and reports of sweeps on made-up results: every printed number is read back."""
 
 import re
+import shutil
 import warnings
 from dataclasses import replace
 
@@ -9,11 +10,14 @@ import pytest
 from matplotlib.figure import Figure
 from rich.console import Console
 
+import studies
+from campaigns.mutations import sweep_folder
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
 from studies.engine import results
 from studies.engine.columns import axis_variables, case_variables, label_of
 from studies.engine.results import SweepData, metric_values
+from studies.engine.sweep import make_plan
 from studies.errors import ResolutionWarning, StudyError
 from studies.show.listing import Rows, print_rows
 from studies.space.indices import elementary_effects, sobol_indices
@@ -22,6 +26,7 @@ from studies.store import Variable
 from studies.study.margin import LEFT_OUT
 from studies.sweeps.documents import best_document
 from studies.sweeps.dry_run import axis_rows
+from studies.sweeps.environments import environments_text
 from studies.sweeps.explore import _figure
 from studies.sweeps.plots import _scale_ordinate, front
 from studies.sweeps.report import report
@@ -712,3 +717,76 @@ def test_ties_keep_the_order_of_the_cases():
     data = usual(residual_rms=np.ones((8, 3, 3)))
     assert ranked_cases(data, "residual_rms").tolist() == list(range(8))
     assert ranked_cases(data, "-residual_rms").tolist() == list(range(8))
+
+
+# --- names of entries, heads, and notes -----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("sweep", "words"),
+    [
+        ({"by": "residual_rms[link=9]"}, r"sweep.by: .* \[link=1 to 3\]"),
+        ({"by": "residual_rms[link=0]"}, r"sweep.by: .* \[link=1 to 3\], \[station=1 or more\]"),
+        ({"by": "residual_rms[3]"}, r"sweep.by: .* residual_rms\[0 to 2\]\[0 or more\]"),
+        ({"screen": {"by": "residual_rms[link=9]"}}, r"sweep.screen.by: .* \[link=1 to 3\]"),
+    ],
+)
+def test_an_entry_that_no_case_has_is_refused_as_the_file_is_read(sweep, words):
+    with pytest.raises(StudyError, match=words):
+        small_spec({"axes": {"gain": GAINS}, **sweep})
+
+
+@pytest.mark.parametrize(
+    "sweep",
+    [
+        {"by": "residual_modal_rms[mode=4]"},
+        {"screen": {"by": "residual_modal_rms[mode=4]"}},
+        {"screen": {"subject_to": "peak_voltage[link=4] < 1"}},
+    ],
+)
+def test_an_entry_that_no_case_has_is_refused_before_a_case_runs(sweep):
+    """Where its number varies, as soon as the cases are known."""
+    with pytest.raises(StudyError, match="mode=1 to 3|link=1 to 3"):
+        make_plan(small_spec({"axes": {"plant_modes": [2, 3]}, **sweep}))
+
+
+def test_a_ranking_by_an_axis_has_a_head_without_cases():
+    data = usual()
+    assert counted_text(data, "gain") == counted_text(data, "control.gain_factor") == ""
+    assert counted_text(data, "residual_rms").startswith("largest of")
+
+
+def test_repeats_are_no_environments():
+    axes = {"gain": GAINS[:2], "load.mass": [0.0, 0.1, 0.2]}
+    for repeats, words in (
+        (1, "of its 3 environments (load.mass);"),
+        (2, "of its 6 cases, environments (load.mass) times 2 repeats;"),
+    ):
+        sweep = {"axes": axes, "environments": ["load.mass"], "repeats": repeats}
+        assert words in environments_text(made_up(sweep))
+
+
+def test_a_sweep_without_a_finished_case_says_so(tmp_path, capsys):
+    """Not that single precision lacks its metrics."""
+    _, folder = sweep_folder(tmp_path)
+    shutil.rmtree(folder / "chunks")
+    code, _, text = run(capsys, "plot", folder)
+    assert code == 2 and "no case has finished" in text and "float32" not in text
+
+
+def test_what_of_a_folder_is_not_shown_is_said(tmp_path, capsys):
+    """By every command that reads it, and by `load` as a warning and an attribute."""
+    _, folder = sweep_folder(tmp_path)
+    file, chunk = folder / "sweep.json", next((folder / "chunks").glob("*.h5"))
+    (chunk.parent / "000007-0123456789abcdef.h5").write_bytes(b"x")
+    file.write_text(re.sub(r'("gain": \[\s*)0.1', r"\g<1>0.2", file.read_text()))
+    words = "2 finished cases in this folder are not of this sweep"
+    damaged = "1 of the files in .* are damaged .000007-0123456789abcdef.h5."
+    for command in (("show",), ("best", "--by", "residual_rms"), ("plot",)):
+        code, _, text = run(capsys, command[0], folder, *command[1:])
+        assert code == 0 and words in text and re.search(damaged, text)
+    with pytest.warns(UserWarning, match="finished cases|damaged"):
+        loaded = studies.load(folder)
+    assert words in loaded.attrs["notes"] and re.search(damaged, loaded.attrs["notes"])
+    with pytest.warns(UserWarning, match="not of this sweep"):
+        studies.table(folder)
