@@ -4,6 +4,7 @@ import re
 import shutil
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,12 +15,13 @@ import studies
 from campaigns.mutations import sweep_folder
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
-from studies.engine import results
+from studies.engine import design, results
 from studies.engine.columns import axis_variables, case_variables, label_of
 from studies.engine.results import SweepData, metric_values
 from studies.engine.sweep import make_plan
 from studies.errors import ResolutionWarning, StudyError
 from studies.show.listing import Rows, print_rows
+from studies.single.run import Replay
 from studies.space.indices import elementary_effects, sobol_indices
 from studies.space.table import build_table
 from studies.store import Variable
@@ -790,3 +792,23 @@ def test_what_of_a_folder_is_not_shown_is_said(tmp_path, capsys):
     assert words in loaded.attrs["notes"] and re.search(damaged, loaded.attrs["notes"])
     with pytest.warns(UserWarning, match="not of this sweep"):
         studies.table(folder)
+
+
+def test_a_replay_differs_in_any_number_that_was_kept(monkeypatch):
+    """Metrics, margins, conditions: within what is allowed; NaN is nothing to compare with."""
+    kept = {"gain_margin": 2.0, "disk_margin": 0.5, "residual_rms": [[1.0, np.nan]], "bad_time": 0}
+    kept = {name: np.array(value, float) for name, value in kept.items()}
+    numbers = dict(kept)
+    monkeypatch.setattr(design, "_numbers", lambda run, names: numbers)
+    run = SimpleNamespace(status=0)
+    assert Replay(run, 0, design.deviations(run, kept)).agrees
+    for name, factor in (("gain_margin", 1.03), ("residual_rms", 2.0), ("disk_margin", np.nan)):
+        numbers[name] = factor * kept[name]
+        again = Replay(run, 0, design.deviations(run, kept))
+        assert not again.agrees and any(f"{name} differs by" in note for note in again.notes)
+        numbers[name] = kept[name]
+    numbers["bad_time"] = np.array(1e-3)
+    assert not Replay(run, 0, design.deviations(run, kept)).agrees
+    numbers |= {"bad_time": kept["bad_time"], "gain_margin": 1.01 * kept["gain_margin"]}
+    assert Replay(run, 0, design.deviations(run, kept)).agrees
+    assert not Replay(run, 3, {}).agrees
