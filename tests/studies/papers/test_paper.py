@@ -382,7 +382,7 @@ def test_failure_while_writing_leaves_old_files_whole(short, tmp_path, monkeypat
     def fail(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr(papers, "save", fail)
+    monkeypatch.setattr(papers, "draw", fail)
     with pytest.raises(StudyError, match="disk full"):
         papers.run_card(card_of(short.machines), tmp_path, Console(quiet=True))
     assert [file.name for file in tmp_path.iterdir()] == ["report.html"]

@@ -248,7 +248,7 @@ def deep(n):
         ({"free": GAIN, "families": {"one": {"set": {"link.modes": 3}}}}, "n_modes = 3 where"),
         (
             {"free": GAIN, "families": {"one": {"set": {"motion.move_time": 0.06}}}},
-            "tune.families.one: .* run.duration",
+            "tune.families.one: run.duration = 0.06; allowed: 0.08 or more",
         ),
         ({"free": GAIN, "families": {"..": {}}}, "not first a sign"),
         ({"free": GAIN, "families": {"$x$": {}}}, "not first a sign"),
