@@ -40,6 +40,8 @@ KEPT = Path(__file__).parent / ".pytest_cache" / "programs"
 KEPT.mkdir(mode=0o700, parents=True, exist_ok=True)
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(KEPT))
 config.configure()
+# what must be compiled depends on what earlier runs have kept
+config.tell_wait = lambda text: None
 # tables as wide as they need to be, wherever the tests run
 os.environ["COLUMNS"] = "240"
 

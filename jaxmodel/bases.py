@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from jaxmodel.beam import ModalBasis, build_basis, held_frequency, mask_modes
 from jaxmodel.case import Case, Structure
-from jaxmodel.lazy import jax, jnp
+from jaxmodel.lazy import compiled, jax, jnp
 from jaxmodel.parameters import Array, Beam, Patches
 
 
@@ -20,6 +20,7 @@ class Bases(NamedTuple):
     believed_omega: Array  # what its filters and shaper are designed for [rad/s], (3, C)
 
 
+@compiled("structure")
 def find_bases(structure: Structure, case: Case) -> Bases:
     """Bases of plant and controller.
 

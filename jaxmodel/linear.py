@@ -17,7 +17,7 @@ from jaxmodel.drive import Reference, slider_force
 from jaxmodel.drives import DRIVES
 from jaxmodel.dynamics import inverse_dynamics, kinetic_energy, modal_chain
 from jaxmodel.kinematics import close_chain
-from jaxmodel.lazy import jax, jnp
+from jaxmodel.lazy import compiled, jax, jnp
 from jaxmodel.loop import Loop, PlantState, plant_rates
 from jaxmodel.parameters import Array
 
@@ -65,6 +65,7 @@ def resting(structure: Structure, case: Case) -> Moment | None:
     return Moment(still, still, case.load.wrench)
 
 
+@compiled("structure", "is_held")
 def linearise(
     structure: Structure,
     loop: Loop,

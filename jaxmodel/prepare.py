@@ -26,7 +26,7 @@ from jaxmodel.kinematics import close_chain
 from jaxmodel.laws import LAWS, is_modal, n_channels
 from jaxmodel.laws.contract import NominalModel, check_feedback
 from jaxmodel.laws.poles import is_unplaceable
-from jaxmodel.lazy import jax, jnp
+from jaxmodel.lazy import compiled, jax, jnp
 from jaxmodel.loop import Delayed, LeftOut, Loop, Rest
 from jaxmodel.notch import design_notch
 from jaxmodel.parameters import Array
@@ -72,6 +72,7 @@ class ControllerDesign(NamedTuple):
     actuator_condition: Array  # (3,)
 
 
+@compiled("structure")
 def prepare(structure: Structure, case: Case) -> Prepared:
     """Compute everything the loop needs.
 

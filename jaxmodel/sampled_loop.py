@@ -21,7 +21,7 @@ from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import DriveState, resting_drive
 from jaxmodel.electronics import FASTEST
 from jaxmodel.exponential import exponential
-from jaxmodel.lazy import jax, jnp
+from jaxmodel.lazy import compiled, jax, jnp
 from jaxmodel.linear import LinearPlant, Moment, linearise, resting
 from jaxmodel.loop import Loop
 from jaxmodel.parameters import Array
@@ -47,6 +47,7 @@ class LoopMatrices(NamedTuple):
     reference: Array | None = None
 
 
+@compiled("structure")
 def closed_loop(
     structure: Structure,
     case: Case,

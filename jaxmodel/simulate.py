@@ -15,7 +15,7 @@ from jaxmodel.delay import command_change, true_delay
 from jaxmodel.drives import DRIVES
 from jaxmodel.dynamics import inverse_dynamics, with_platform
 from jaxmodel.kinematics import inverse_kinematics, path_status, singularity_distance
-from jaxmodel.lazy import jax, jnp
+from jaxmodel.lazy import compiled, jax, jnp
 from jaxmodel.loop import Inputs, Loop, Record, State, initial_state, step
 from jaxmodel.motion import end_of_path, shape_path
 from jaxmodel.parameters import Array
@@ -50,6 +50,7 @@ class Command(NamedTuple):
     singularity_distance: Array  # of the path from poses no drive reaches or holds [rad], ()
 
 
+@compiled("structure")
 def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
     """Shaped reference, disturbances, noise and metric windows of a case.
 
@@ -351,6 +352,7 @@ def conclude(outline: Outline, code: Array, last: State, record: Record | None =
     )
 
 
+@compiled("structure", "has_record")
 def simulate(structure: Structure, case: Case, has_record: bool = False) -> Result:
     """Run one case with the reference executor, a scan; other executors replace only the scan.
 

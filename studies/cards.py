@@ -127,10 +127,9 @@ def _fit(fitted: Any) -> Card:
     from studies.fitting.report import statements, value_rows
 
     heads = ["parameter", "value", "sigma", "unit", "95 %", ""]
-    drawing = next(iter(drawings(fitted).values()), None)
-    return Card(
-        fitted.study.title, statements(fitted), heads, value_rows(fitted), drawing and drawing()
-    )
+    drawing = next(iter(drawings(fitted).values()), lambda: None)
+    rows = value_rows(fitted)
+    return Card(fitted.study.title, statements(fitted), heads, rows, figure=drawing())
 
 
 def _certificate(certificate: Any) -> Card:

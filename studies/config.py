@@ -10,6 +10,7 @@ import importlib.metadata
 import os
 import platform
 import re
+import sys
 import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -151,6 +152,16 @@ def keep_programs() -> None:
     _keeps_programs = True
 
 
+#: Whether a command shows its phases, and so what it waits for.
+shows_phases = False
+
+
+def tell_wait(text: str) -> None:
+    """Say what a command without phases waits for."""
+    if _keeps_programs and not shows_phases:
+        print(f"studies: {text}", file=sys.stderr, flush=True)
+
+
 def stop_keeping_programs() -> None:
     """For parts of the user's own: no name tells what files these have read."""
     global _keeps_programs
@@ -186,6 +197,8 @@ def start(precision: str = "float64", gpu: bool = False) -> None:
     Raises StudyError as `configure`, or if JAX cannot start.
     """
     configure(precision)
+    if _has_cache and not any(chosen_folder().iterdir()):
+        tell_wait("the first commands on a machine compile what they need, up to a minute each ...")
     import jax
 
     if not gpu:

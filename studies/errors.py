@@ -126,7 +126,9 @@ def nearest_field(name: str, fields: Iterable[str]) -> str:
     parts = [(*lower.rpartition("."), field) for lower, field in reversed(whole.items())]
     own = {last: field for where, _, last, field in parts if where == section}
     anywhere = {last: field for _, _, last, field in parts}  # the first section that has it
-    close = _closest(leaf, own) or _closest(leaf, anywhere)
+    turned = {"".join(sorted(last)): field for last, field in own.items()}  # pk for kp
+    close = _closest(leaf, own) or turned.get("".join(sorted(leaf)), "")
+    close = close or _closest(leaf, anywhere)
     return close if close or own else _closest(name.lower(), whole)
 
 

@@ -5,19 +5,20 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple, Protocol
 
 import jax
 import numpy as np
+from rich.console import Console
 
 from jaxmodel.case import Case, Structure, with_ratio
 from jaxmodel.simulate import Result
 from studies.engine.executor import Executor, own_ratios
 from studies.engine.margins import judge_loops, no_margins
 from studies.engine.plan import Chunk, Group, Layout, chunk_cases, local_layout
-from studies.engine.progress import Reporter
+from studies.engine.progress import Phases, Reporter
 from studies.engine.robustness import judge_robustness
 from studies.engine.stability import LoopFigures
 from studies.kernels.compilation import compiler_time
@@ -117,6 +118,16 @@ class LocalRunner:
             for future in begun:
                 if future.done() and not future.cancelled() and future.exception() is None:
                     future.result().first.cancel()
+
+
+def run_quietly(table: CaseTable, groups: list[Group]) -> Iterator[Done]:
+    """Chunks of groups, run here without a word."""
+    count = sum(len(group.rows) for group in groups)
+    with Phases(Console(quiet=True), ("compile", "run"), is_quiet=True) as phases:
+        reporter = Reporter(phases, "run", count, 0, len(groups))
+        for done in LocalRunner().run(table, groups, reporter, threading.Event()):
+            assert isinstance(done, Done)  # only workers of a cluster give chunks up
+            yield done
 
 
 class _BegunGroup(NamedTuple):

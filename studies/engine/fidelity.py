@@ -6,17 +6,14 @@ not. A few random designs of the user's own space, run by both models, tell.
 
 from __future__ import annotations
 
-import threading
 from typing import NamedTuple
 
 import numpy as np
-from rich.console import Console
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
-from studies.engine.chunks import Done, LocalRunner
+from studies.engine.chunks import run_quietly
 from studies.engine.plan import local_layout, plan_groups
-from studies.engine.progress import Phases, Reporter
 from studies.engine.results import direction
 from studies.engine.screen import chunk_values
 from studies.errors import StudyError
@@ -99,10 +96,7 @@ def _values(
     """What designs are ranked by, NaN where the run is not ok, (len(rows),)."""
     values, metric = np.full(len(table), np.nan), entry.partition("[")[0]
     groups = plan_groups(table, rows, local_layout, (metric,), is_linear, is_judged=False)
-    with Phases(Console(quiet=True), ("compile", "run"), is_quiet=True) as phases:
-        reporter = Reporter(phases, "run", len(rows), 0, len(groups))
-        for done in LocalRunner().run(table, groups, reporter, threading.Event()):
-            assert isinstance(done, Done)  # only workers of a cluster give chunks up
-            code, found = chunk_values(spec, table, done, entry)
-            values[done.chunk.rows] = np.where(code == status.OK, found, np.nan)
+    for done in run_quietly(table, groups):
+        code, found = chunk_values(spec, table, done, entry)
+        values[done.chunk.rows] = np.where(code == status.OK, found, np.nan)
     return values[rows]

@@ -29,7 +29,7 @@ import jaxlib
 import numpy as np
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
-from studies import sources
+from studies import config, sources
 from studies.config import device_now, is_keeping, on_host, processor_text, without_jax_cache
 from studies.kernels import native
 from studies.kernels.compilation import ObjectCache
@@ -170,7 +170,8 @@ def program(names: list[Any], arguments: list[Any], lower: Callable[[], Any], mo
         found = _PROGRAMS.get(name)
         if found is None:
             modules = module, *modules_of(names)
-            found = _PROGRAMS[name] = _load_or_compile(name, lower, modules)
+            label = str(names[0]).rpartition(".")[2].strip("_").replace("_", " ")
+            found = _PROGRAMS[name] = _load_or_compile(name, label, lower, modules)
         return found
 
 
@@ -190,13 +191,16 @@ def _mappings() -> int:
         return 0
 
 
-def _load_or_compile(name: str, lower: Callable[[], Any], modules: Iterable[str]) -> Any:
+def _load_or_compile(
+    name: str, label: str, lower: Callable[[], Any], modules: Iterable[str]
+) -> Any:
     if not is_keeping():
         return lower().compile()
     entry = ObjectCache("program", name, *environment(*modules))
     content = entry.take()
     if content and (loaded := _load(content)) is not None:
         return loaded
+    config.tell_wait(f"compiling {label}, which is kept for later runs ...")
     lowered = lower()
     with without_jax_cache():
         compiled = lowered.compile()

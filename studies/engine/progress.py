@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from jaxmodel import status
+from studies import config
 from studies.engine.folder import ranges
 
 
@@ -41,6 +42,7 @@ class Phases:
         self._title = ""
 
     def __enter__(self) -> Phases:
+        config.shows_phases = True
         if self.console.is_jupyter and not self.is_quiet:
             from IPython.display import display  # which is there in a notebook
 
@@ -63,6 +65,7 @@ class Phases:
         return time.perf_counter() - self._started
 
     def __exit__(self, *_: object) -> None:
+        config.shows_phases = False
         if self._bar is not None:
             self._bar.stop()
 

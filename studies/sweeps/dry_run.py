@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
+from studies.config import usable_cores
+from studies.engine.chunks import run_quietly
+from studies.engine.plan import local_layout
 from studies.engine.preflight import check_run
+from studies.engine.progress import duration_text
+from studies.engine.stored import chunk_arrays
 from studies.engine.sweep import Plan
 from studies.errors import StudyError
 from studies.show.listing import Rows, print_rows
@@ -17,9 +24,55 @@ from studies.study.paths import field_unit, parse_entry
 from studies.sweeps.records import Record
 from studies.sweeps.show import short_value
 
+#: Cases of each program that are run to measure how long all of them take.
+MEASURED = 32
+
+
+def estimate(plan: Plan) -> dict[str, float]:
+    """Time and storage that the cases left take in this process, measured on some of each program.
+
+    Returns:
+        "seconds" of running and judging; "compile_seconds" spent here, which commands need not
+        spend again; "bytes" on disk; "measured_cases".
+    """
+    found = dict.fromkeys(("seconds", "compile_seconds", "bytes", "measured_cases"), 0.0)
+    for group in plan.groups:
+        count = min(MEASURED, len(group.rows))
+        chosen = np.linspace(0, len(group.rows) - 1, count).astype(int)
+        some = group._replace(
+            rows=group.rows[chosen],
+            is_too_stiff=group.is_too_stiff[chosen],
+            layout=local_layout(count, group.structure),
+        )
+        spent = []
+        for _ in range(2):  # the first one compiles
+            began = time.perf_counter()
+            chunks = list(run_quietly(plan.table, [some]))
+            spent.append(time.perf_counter() - began)
+        share = len(group.rows) / count
+        found["seconds"] += share * spent[1]
+        found["compile_seconds"] += max(spent[0] - spent[1], 0.0)
+        for done in chunks:
+            arrays = chunk_arrays(plan.table, done, list(done.judged.result.metrics))
+            found["bytes"] += share * sum(x.nbytes for x in arrays.values())
+        found["measured_cases"] += count
+    return found
+
+
+def estimate_text(plan: Plan, found: dict[str, float]) -> str:
+    """The same as a sentence."""
+    left = sum(len(group.rows) for group in plan.groups)
+    return (
+        f"time: about {duration_text(found['seconds'])} for {count_text(left, 'case')} in this "
+        f"process on {count_text(usable_cores(), 'core')}, by {found['measured_cases']:.0f} that "
+        f"were run, and what compiling takes, {duration_text(found['compile_seconds'])} just now; "
+        f"N machines like this one (--scheduler) take 1/N. Storage: "
+        f"about {found['bytes'] / 2**20:.2g} MiB"
+    )
+
 
 def print_plan(plan: Plan, console: Console) -> None:
-    """Print what a sweep would run, and a sample case; builds no program."""
+    """Print what a sweep would run, a sample case, and how long it would take."""
     table = plan.table
     console.print(
         f"{len(table)} cases ({table.n_dropped} left out by where, {table.n_double} duplicates, "
@@ -47,6 +100,9 @@ def print_plan(plan: Plan, console: Console) -> None:
         console.print(f"the sample cannot run: {fault}")
     if not plan.groups:
         console.print("nothing left to run")
+        return
+    console.print("measuring how long that takes ...")
+    console.print(estimate_text(plan, estimate(plan)), soft_wrap=True)
 
 
 def plan_document(plan: Plan) -> dict[str, Any]:
@@ -77,6 +133,7 @@ def plan_document(plan: Plan) -> dict[str, Any]:
         "programs": programs,
         "sample": sample_record(table),
         "sample_fault": sample_fault(table),
+        "estimate": estimate(plan),
     }
 
 

@@ -37,7 +37,7 @@ from studies.export.floating import respond as respond_floating
 from studies.export.in_the_loop import replay
 from studies.export.integers import respond as respond_fixed
 from studies.export.run import DAC_BITS
-from studies.export.verify import DOUBLE, _largest_demand, compare_values, load_code
+from studies.export.verify import DOUBLE, _limits, compare_values, load_code
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table
 from studies.spillover.certificate import certify
@@ -100,7 +100,7 @@ def assert_code_is_the_controller(study):
     source = floating_source(exported, "own", ["a test"])
     with load_code(exported, source, "own", compiler, np.float64, np.float64) as code:
         volts, faults = code.respond(codes * step)
-    largest = _largest_demand(exported, codes)
+    largest, _ = _limits(exported, codes)
     check = compare_values("", volts, wanted, DOUBLE, largest)
     assert check.is_met and not faults.any(), check
     signals = respond_floating(exported.channels, exported.controller, codes)

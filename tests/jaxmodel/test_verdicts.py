@@ -108,7 +108,7 @@ def test_what_explains_the_rest_comes_first():
 def test_only_finished_runs_have_metrics(code):
     found = ended(last=code, saturated_fraction=1.0)
     assert found.status == (status.SATURATED if code == status.OK else code)
-    has_metrics = code in (0, 5, 10, 16, 18, 19, 20, 21)
+    has_metrics = code in (0, 5, 10, 16, 18, 19, 20, 21, 25)
     assert np.all(np.isfinite(found.metrics.residual_rms)) == has_metrics
     # the time of a fault is the loop's, or where it was known beforehand the command's
     assert found.bad_time == 0.75

@@ -1,6 +1,10 @@
 """Progress of long commands: which phase they are in, and what is left of it."""
 
 import io
+import os
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -8,6 +12,7 @@ from rich.console import Console
 
 from studies.engine import progress
 from studies.engine.progress import Phases, Reporter, duration_text
+from tests.canonical import TINY, text_of
 
 NAMES = ("compile", "run", "join", "draw")
 
@@ -91,3 +96,24 @@ def test_quiet_phases_say_nothing():
 
 def test_durations_in_words():
     assert [duration_text(x) for x in (40, 180, 7800)] == ["40 s", "3 min", "2 h 10 min"]
+
+
+@pytest.mark.long
+def test_a_first_command_says_at_once_what_it_waits_for(tmp_path):
+    """And nothing of it the second time."""
+    (tmp_path / "cache").mkdir(mode=0o700)
+    (tmp_path / "tiny.toml").write_text(text_of(TINY))
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")}
+    command = [sys.executable, "-m", "studies.cli", "simulate", str(tmp_path / "tiny.toml")]
+    told = []
+    for _ in range(2):
+        began = time.monotonic()
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as run:
+            first = run.stderr.readline()
+            waited = time.monotonic() - began
+            told.append(first + run.stderr.read())
+        assert run.returncode == 0
+        if len(told) == 1:
+            assert waited < 10 and "the first commands on a machine compile" in first
+            assert "compiling simulate" in told[0] and "compiling loops" in told[0]
+    assert "compiling" not in told[1]

@@ -8,7 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxmodel.bases import find_bases
 from jaxmodel.case import Structure
+from jaxmodel.lazy import compiled
+from jaxmodel.linear import linearise
+from jaxmodel.prepare import prepare
+from jaxmodel.sampled_loop import closed_loop
+from jaxmodel.simulate import command, simulate
 from studies import config, sources
 from studies.engine import programs
 from studies.engine.programs import kept_data, kept_jit
@@ -194,3 +200,21 @@ def test_a_word_in_a_report_leaves_all_programs_kept(tmp_path):
     for name in reports:
         assert not changed(name), name
     assert changed("jaxmodel/beam.py") == {*modules}
+
+
+def test_functions_of_the_model_run_as_one_program():
+    """Called with numbers, they are traced once; in a transformation they are its own part."""
+    traced = []
+
+    @compiled("structure", "is_held")
+    def scaled(structure, x, is_held=False):
+        traced.append(structure)
+        return x * (2.0 if is_held else 3.0)
+
+    assert [float(scaled(("a", 1), x)) for x in (1.0, 2.0)] == [3.0, 6.0]
+    assert traced == [("a", 1)]
+    assert float(scaled(("a", 1), 1.0, is_held=True)) == 2.0
+    assert str(jax.make_jaxpr(lambda x: scaled(("b", 1), x))(1.0)).count("pjit") == 0
+    assert float(jax.grad(lambda x: scaled(("b", 1), x))(1.0)) == 3.0
+    for function in (prepare, closed_loop, simulate, command, linearise, find_bases):
+        assert function.__wrapped__ and function.__doc__

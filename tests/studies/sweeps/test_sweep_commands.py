@@ -15,7 +15,6 @@ from PIL import Image
 from studies.engine.design import load_design
 from studies.engine.folder import BASELINE, MANIFEST
 from studies.engine.frame import frame_of
-from studies.engine.function import TRACES
 from studies.engine.preflight import check_run
 from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import run_study
@@ -67,10 +66,11 @@ def spec(tmp_path_factory):
 
 def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
     out = tmp_path / "s"
-    before = TRACES.copy()
     code, text, _ = run(capsys, "sweep", spec, "--dry-run")
-    assert code == 0 and "40 cases" in text and "sample: case 20" in text and before == TRACES
+    assert code == 0 and "40 cases" in text and "sample: case 20" in text
     assert not out.exists() and "cannot run" not in text
+    assert re.search(r"time: about \d+ s for 40 cases .* by 32 that were run", text)
+    mebibytes = float(re.search(r"Storage: about (\S+) MiB", text)[1])
     code, text, _ = run(capsys, "sweep", spec, "--out", out, "--report")
     assert (
         code == 0
@@ -79,6 +79,7 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
         and "results.h5" in text
     )
     assert f"report: {out / 'report.html'}\n" in text
+    assert mebibytes == pytest.approx((out / "results.h5").stat().st_size / 2**20, rel=0.8)
     check_report(out)
     check_uncontrolled(capsys, spec, out)
     check_explorer(capsys, out)
