@@ -37,6 +37,7 @@ def descent(spec: TuneSpec, findings: TuneFindings) -> Figure:
             )
         if not np.isfinite(best).any():
             ax.text(0.5, 0.5, "no design keeps the limits", ha="center", transform=ax.transAxes)
+            ax.set_yticks([])
         ax.set(xlabel="iteration", ylabel=OBJECTIVE, xlim=(0.5, len(best) + 0.5))
         figures.log_scale(ax, "y")
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -23,6 +23,7 @@ from studies.errors import StudyError
 from studies.publish import REPORT, publish
 from studies.show.figures import draw
 from studies.show.sketch import sketch
+from studies.show.units import count_text
 from studies.store import write_store
 from studies.study.spec import Study
 from studies.study.template import signed, study_template
@@ -116,6 +117,12 @@ def _tune(
         phases.say(f"continuing after iteration {int(before.iteration)}")
     phases.begin("compile", "starting points by the linear loop, and the first iteration")
     evaluator, clock = evaluator or make_evaluator(spec), _Clock()
+    left = spec.tune.iterations - (0 if before is None else int(before.iteration))
+    phases.say(
+        f"{count_text(len(evaluator.families), 'starting point')}: {evaluator.lanes} runs with "
+        f"derivatives in each of at most {count_text(left, 'iteration')}; how long these take is "
+        "known from the second one on"
+    )
 
     written: dict[str, str] = {}
 
