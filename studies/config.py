@@ -154,11 +154,13 @@ def keep_programs() -> None:
 
 #: Whether a command shows its phases, and so what it waits for.
 shows_phases = False
+_told: set[str] = set()
 
 
 def tell_wait(text: str) -> None:
     """Say what a command without phases waits for."""
-    if _keeps_programs and not shows_phases:
+    if _keeps_programs and not shows_phases and text not in _told:
+        _told.add(text)
         print(f"studies: {text}", file=sys.stderr, flush=True)
 
 

@@ -19,12 +19,11 @@ from studies.engine.robustness import judge_robustness
 from studies.engine.run_data import metric_variables
 from studies.engine.runs import Run
 from studies.errors import DataWarning, StudyError, field_error, nearest
-from studies.reading import read_bytes
+from studies.reading import read_text
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table, case_study
-from studies.study.files import find_spec
+from studies.study.files import SIGNATURE, find_spec
 from studies.study.spec import Study, load_study
-from studies.study.template import is_edited
 
 #: Largest relative differences of a case run alone in single precision, and of its loop, which
 #: sweeps judge along frequencies and runs by eigenvalues [1].
@@ -91,10 +90,11 @@ def load_design(path: str | Path, case: int | str | None = None) -> Design:
         return Design(load_study(path), {})
     if (path / TUNING).is_file():
         file = _tuned_file(path, case)
-        if is_edited(read_bytes(file).decode(errors="replace")):
-            text = f"{file}: edited since the tuning has written it; this is no longer its result"
+        study = load_study(file)  # warns of one that has been edited below its first line
+        if not read_text(file).startswith(SIGNATURE):
+            text = f"{file}: without the tuning's signature: edited, or of an older version"
             warnings.warn(text, DataWarning, stacklevel=2)
-        return Design(load_study(file), {})
+        return Design(study, {})
     data = read_sweep(path)
     number = _case_number(data, None if case is None else str(case), path)
     spec = parse_sweep(read_manifest(path)["spec"])

@@ -45,7 +45,7 @@ from studies.engine.screen import (
 from studies.engine.stored import chunk_arrays, kept_metrics, manifest_attributes, merge
 from studies.errors import StudyError
 from studies.publish import shown
-from studies.space.spec import READING, SELECTING, SPREADING, SweepSpec
+from studies.space.spec import READING, SELECTING, SPREADING, SweepSpec, load_sweep
 from studies.space.table import CaseTable, build_table
 from studies.study.fields import idle_axes
 
@@ -110,7 +110,7 @@ def make_plan(spec: SweepSpec, out: Path | None = None) -> Plan:
 
 
 def run_sweep(
-    spec: SweepSpec,
+    spec: SweepSpec | str | Path,
     out: str | Path,
     is_resumed: bool = False,
     console: Console | None = None,
@@ -121,7 +121,7 @@ def run_sweep(
     """Run a sweep into a folder.
 
     Args:
-        spec: the sweep.
+        spec: the sweep, or its file.
         out: its folder.
         is_resumed: continue or extend the existing sweep.
         console: where progress goes; default: standard output.
@@ -136,6 +136,7 @@ def run_sweep(
         StudyError: a fault of the sweep, the folder or the disk. Finished chunks stay.
     """
     config.require_configured()
+    spec = spec if isinstance(spec, SweepSpec) else load_sweep(spec)
     runner, out = runner or LocalRunner(), Path(out)
     if phases is None:
         console = console or Console(highlight=False, markup=False)

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.parameters import Array
-from studies.errors import StudyError, field_error, nearest
+from studies.errors import StudyError, field_error, nearest, nearest_field
 from studies.space.axes import ALIASES, READY_MADE, Range, parse_range
 from studies.study.cases import case_of
 from studies.study.numbers import Numbers, position, put
@@ -171,7 +171,7 @@ def plain_numbers(
     assert entry is not None
     allowed = free_fields(parts or (parts_of(study),), *roles)
     if entry.field not in allowed:
-        hint = nearest(entry.field, allowed)
+        hint = nearest_field(entry.field, allowed)
         raise StudyError(
             f"{path}: cannot be free; fields that can are {', '.join((*allowed, *others))}"
             + (f"; did you mean {hint!r}?" if hint else "")

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tomllib
+import warnings
 from pathlib import Path
 from typing import Any
 
-from studies.errors import StudyError, field_error, nearest, shown
+from studies.errors import DataWarning, StudyError, field_error, nearest, shown
 from studies.reading import check_depth, read_text
 from studies.study.state_space import with_matrices
 
 #: Folder of the package's ready-made files, available by name.
 READY = Path(__file__).parents[1] / "specs"
+#: Begins a study file that a command has written into its folder.
+SIGNATURE = "# Written by the command; the digest of what follows: "
 #: Bytes of a file's name that file systems take.
 LONGEST_NAME = 255
 
@@ -59,9 +63,30 @@ def read_toml(name: str | Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise StudyError(f"study file {path}: cannot be read ({reason})") from None
+    if text.startswith(SIGNATURE) and not _is_signed(text):
+        edited = f"{path}: edited since the command has written it; no longer its result"
+        warnings.warn(edited, DataWarning, stacklevel=2)
     try:
         data = tomllib.loads(text)
         check_depth(data)
     except (ValueError, RecursionError) as error:  # ValueError: also a number of 5000 digits
         raise StudyError(f"study file {path}: not valid TOML ({error})") from None
     return with_matrices(data, path.parent)
+
+
+def signed(text: str) -> str:
+    """A study file whose first line tells whether somebody has edited it since."""
+    return f"{SIGNATURE}{hashlib.sha256(text.encode()).hexdigest()[:16]}\n{text}"
+
+
+def is_as_written(path: Path) -> bool:
+    """Whether a file is one that a command has signed, unchanged."""
+    try:
+        return _is_signed(read_text(path))
+    except (OSError, ValueError):
+        return False
+
+
+def _is_signed(text: str) -> bool:
+    text = text.replace("\r\n", "\n")  # of an editor that has changed nothing else
+    return text == signed(text.partition("\n")[2])

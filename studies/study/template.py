@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 from collections.abc import Mapping
@@ -81,25 +80,6 @@ def study_template(study: Study | None = None) -> str:
             for field in type(section).model_fields:
                 lines += _field(section, field)
     return "\n".join(lines) + "\n"
-
-
-#: Begins a study file that a command has written into its folder.
-_SIGNATURE = "# Written by the command; the digest of what follows: "
-
-
-def signed(text: str) -> str:
-    """A study file whose first line tells whether somebody has edited it since."""
-    return f"{_SIGNATURE}{_digest(text)}\n{text}"
-
-
-def is_edited(text: str) -> bool:
-    """Whether a signed study file has been edited; one without a signature is its writer's own."""
-    first, _, rest = text.partition("\n")
-    return first.startswith(_SIGNATURE) and first != f"{_SIGNATURE}{_digest(rest)}"
-
-
-def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def write_study(out: str | Path, study: Study | None = None) -> None:

@@ -75,8 +75,8 @@ def print_plan(plan: Plan, console: Console) -> None:
     """Print what a sweep would run, a sample case, and how long it would take."""
     table = plan.table
     console.print(
-        f"{len(table)} cases ({table.n_dropped} left out by where, {table.n_double} duplicates, "
-        f"{plan.n_before} already computed)"
+        f"{count_text(len(table), 'case')} ({table.n_dropped} left out by where, "
+        f"{table.n_double} duplicates, {plan.n_before} already computed)"
     )
     for line in idle_axes(table.study, table.columns):
         console.print(line)
@@ -100,6 +100,7 @@ def print_plan(plan: Plan, console: Console) -> None:
         console.print(f"the sample cannot run: {fault}")
     if not plan.groups:
         console.print("nothing left to run")
+    if not plan.groups or (sample_fault(table) and len(table) == 1):
         return
     console.print("measuring how long that takes ...")
     console.print(estimate_text(plan, estimate(plan)), soft_wrap=True)

@@ -14,9 +14,10 @@ import numpy as np
 from studies.engine.folder import TUNING, TUNINGS, locked_folder, refuse_existing
 from studies.errors import StudyError
 from studies.publish import check_target, replacing
-from studies.reading import read_bytes, read_json, read_npz
+from studies.reading import read_json, read_npz
+from studies.study.files import is_as_written, signed
 from studies.study.spec import Study
-from studies.study.template import is_edited, signed, study_template
+from studies.study.template import study_template
 from studies.tuning.optimise import Progress
 
 MANIFEST, PROGRESS, RESULTS = TUNING, "progress.npz", "tune.h5"
@@ -46,7 +47,8 @@ def open_tuning(out: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterat
                         f"--out {out}: was begun with another {what}; name a new folder"
                     )
             before = load_progress(out / PROGRESS)
-            _refuse_edited(out)
+            if before is not None:
+                _refuse_edited(out)
         for left in out.iterdir():  # only once their owner is known
             if TUNINGS.leftover.fullmatch(left.name) and left.is_file():
                 left.unlink()
@@ -83,7 +85,7 @@ def write_designs(out: Path, designs: dict[str, Study], written: dict[str, str])
 def _refuse_edited(out: Path) -> None:
     """Raise StudyError if resuming would overwrite what somebody has edited."""
     for path in sorted(out.glob("tuned*.toml")):
-        if is_edited(read_bytes(path).decode(errors="replace")):
+        if not is_as_written(path):
             raise StudyError(
                 f"{path}: edited since the tuning has written it; --resume would overwrite it: "
                 "move it to another folder"

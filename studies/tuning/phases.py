@@ -53,7 +53,7 @@ class KeptPhases:
         self._found: dict[str, Any] = {}
         try:
             arrays = read_npz(self._path)
-            if str(arrays.pop("end")) == self._end:
+            if str(arrays.pop("end")) == self._end and str(arrays.pop("digest")) == _digest(arrays):
                 self._found = unpacked(json.loads(str(arrays.pop("form"))), arrays)
         except (OSError, ValueError, KeyError, TypeError):
             pass  # not there or damaged: the phases run again
@@ -63,11 +63,18 @@ class KeptPhases:
         if name not in self._found:
             self._found[name] = make()
             arrays: dict[str, np.ndarray] = {}
-            form = json.dumps(packed(self._found, arrays))
-            whole: Any = {**arrays, "form": form, "end": self._end}
+            arrays["form"] = np.array(json.dumps(packed(self._found, arrays)))
+            whole: Any = {**arrays, "digest": _digest(arrays), "end": self._end}
             with replacing(self._path) as temporary, temporary.open("wb") as file:
                 np.savez(file, allow_pickle=False, **whole)
         return self._found[name]
+
+
+def _digest(arrays: Mapping[str, np.ndarray]) -> str:
+    whole = hashlib.sha256()
+    for name in sorted(arrays):
+        whole.update(name.encode() + np.ascontiguousarray(arrays[name]).tobytes())
+    return whole.hexdigest()
 
 
 def packed(value: Any, arrays: dict[str, np.ndarray]) -> Any:

@@ -25,8 +25,9 @@ from studies.show.figures import draw
 from studies.show.sketch import sketch
 from studies.show.units import count_text
 from studies.store import write_store
+from studies.study.files import signed
 from studies.study.spec import Study
-from studies.study.template import signed, study_template
+from studies.study.template import study_template
 from studies.tuning import plots
 from studies.tuning.audit import Disagreement, audit
 from studies.tuning.check import RandomSearch, search, tuned_study
@@ -258,7 +259,8 @@ def tuned_studies(spec: TuneSpec, at: Progress, is_over: bool = True) -> dict[st
         is_over: whether the descent has ended, which the titles say.
     """
     studies = {"study.toml": spec.study}
-    state = "" if is_over else f" (best so far, of {int(at.iteration)} iterations, not checked)"
+    done = count_text(int(at.iteration), "iteration")
+    state = "" if is_over else f" (best so far, of {done}, not checked)"
     for k, family in enumerate(spec.moving):
         if _has_finished(at, k):
             tuned = tuned_study(spec, family, spec.free.values(at.best_place[at.winner(k)]))

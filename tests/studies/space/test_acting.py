@@ -164,7 +164,7 @@ kind = "none"
 axes = { link_subsets = ["none"], gain = [0.5, 2.0] }
 """)
     code, out, _ = run(capsys, "sweep", path, "--dry-run")
-    assert code == 0 and "1 cases (0 left out by where, 1 duplicates, " in out
+    assert code == 0 and "1 case (0 left out by where, 1 duplicates, " in out
     assert "no metric depends on control.gain_factor with control.links false" in out
     table = build_table(small_spec({"axes": {"link_subsets": "all"}}))
     assert [x["name"] for x in axis_records(table)] == ["link_subsets"]

@@ -17,6 +17,7 @@ from rich.console import Console
 from studies.engine.design import load_design
 from studies.errors import DataWarning, FigureWarning, StudyError
 from studies.show import figures
+from studies.study.files import is_as_written
 from studies.study.spec import load_study
 from studies.tuning import audit as audit_module
 from studies.tuning import phases as phases_module
@@ -131,10 +132,14 @@ def test_phases_that_have_ended_are_not_repeated(tmp_path):
         for name, value in wanted.items():
             jax.tree.map(np.testing.assert_array_equal, getattr(found, name), value)
     assert type(again.judged[0].own_run) is OwnRun
+    arrays = dict(np.load(out / phases_module.FILE))
+    np.savez(out / phases_module.FILE, **arrays | {"x3": arrays["x3"] * 1.5})
+    with with_phases(check):
+        tune(out, True)
     (out / phases_module.FILE).write_bytes(b"damaged")
     with with_phases(check):
         tune(out, True)
-    assert calls == ["check", "check"]
+    assert calls == ["check"] * 3
 
 
 def test_phases_of_another_end_are_not_used(tmp_path):
@@ -168,9 +173,23 @@ def test_an_edited_result_is_not_taken_for_the_tunings(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert load_design(tmp_path / "out").study == load_study(file)
-    file.write_text(file.read_text().replace("gain_factor = ", "gain_factor = 0.5  # "))
-    with pytest.warns(DataWarning, match="edited since the tuning has written it"):
+    written = file.read_bytes()
+    file.write_bytes(written.replace(b"\n", b"\r\n"))  # changes nothing
+    assert is_as_written(file)
+    edited = written.replace(b"gain_factor = ", b"gain_factor = 0.5  # ")
+    file.write_bytes(edited)
+    with pytest.warns(DataWarning, match="edited since the command has written it"):
+        load_study(file)
+    unsigned = edited.partition(b"\n")[2]
+    for content in (edited, unsigned, b"hello", b"\xff"):
+        file.write_bytes(content)
+        with with_phases(), pytest.raises(StudyError, match="--resume would overwrite it"):
+            tune(tmp_path / "out", True)
+    file.write_bytes(unsigned)
+    with pytest.warns(DataWarning, match="without the tuning's signature"):
         load_design(tmp_path / "out")
+    file.unlink()
+    file.symlink_to("elsewhere.toml")
     with with_phases(), pytest.raises(StudyError, match="--resume would overwrite it"):
         tune(tmp_path / "out", True)
 
