@@ -297,11 +297,14 @@ def test_a_replay_that_ends_otherwise_fails(capsys, monkeypatch, stored, wanted)
     kept = SimpleNamespace(study=None, stored={} if stored is None else {"status": stored})
     monkeypatch.setattr(single_run, "load_design", lambda *_: kept)
     monkeypatch.setattr(single_run, "run_study", lambda _: again)
-    monkeypatch.setattr(single_run, "deviation", lambda *_: (1e-7, "x"))
+    found = {"residual_rms": (1e-7, 1e-6)}
+    monkeypatch.setattr(single_run, "deviations", lambda *_: found)
     code, text, _ = run(capsys, "replay", "folder", "--case", "1")
     assert code == wanted and "this: ok" in text
     assert ("CAUTION: the sweep and this run end differently." in text) == bool(wanted)
-    assert ("largest relative difference of a metric: 1.0e-07 (x)" in text) == (stored is not None)
+    assert ("largest relative difference of a metric: 1.0e-07 (peak_error)" in text) == (
+        stored is not None
+    )
 
 
 @pytest.mark.parametrize("is_passed", [True, False])

@@ -4,7 +4,7 @@ import jax
 import jsonschema
 import numpy as np
 import pytest
-from scipy.linalg import eig, expm
+from scipy.linalg import eig, expm, matrix_balance
 from threadpoolctl import threadpool_limits
 
 from jaxmodel.changes import MachineChange, changed_case
@@ -132,7 +132,7 @@ def analogue_of(design):
         loop = prepare(smooth, case).loop
         plant = linearise(smooth, loop, design.pose, resting(smooth, case))
         whole = analogue_plant(smooth, plant, case)
-        return whole.state, whole.enters, whole.size
+        return whole.state, whole.enters
 
     return jax.jit(evaluate)(design.case)
 
@@ -146,10 +146,12 @@ def analogue(design):
 def test_a_delay_is_a_later_edge_of_the_hold(design, analogue, delay):
     """Beside a simulation: the plant over parts of a sample by SciPy, commands one by one."""
     a, b = np.asarray(analogue[0]), np.asarray(analogue[1])[:, :3]
-    n, size = len(a), np.concatenate([np.asarray(analogue[2]), np.full(3, 1e6)])
+    n = len(a)
     held = np.zeros((n + 3, n + 3))
     held[:n, :n], held[:n, n:] = a, b
+    _, (size, _) = matrix_balance(held, permute=False, separate=True)
     period = float(design.case.electronics.period)
+    volts = 1 / np.abs(b / size[:n, None] * period).max()  # which move the states by their size
     whole, share = int(delay), delay % 1
     parts = [
         expm(held / size[:, None] * size * t * period) * size[:, None] / size
@@ -158,7 +160,7 @@ def test_a_delay_is_a_later_edge_of_the_hold(design, analogue, delay):
     matrix = design.transition(rest()._replace(delay=np.array(delay)))
     rng = np.random.default_rng(0)
     state = rng.normal(size=len(matrix))
-    state *= np.concatenate([size[:n], np.full(len(state) - n, 1e6)])
+    state *= np.concatenate([size[:n], np.full(len(state) - n, volts)])
     x = state[:n]
     # the newest command is the controller's, older ones follow the plant's state, newest first
     latest = [state[-3:], *np.split(state[n : n + 9], 3)]

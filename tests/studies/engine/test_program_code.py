@@ -28,7 +28,7 @@ def strangers(fresh_programs, monkeypatch):
     jax.clear_caches()  # what was traced before would not run again
     found, compiled = {}, programs._load_or_compile
 
-    def watched(name, lower, modules):
+    def watched(name, label, lower, modules):
         known = set(sources.closure([programs.__name__, *modules]))
         seen = set()
 
@@ -39,7 +39,7 @@ def strangers(fresh_programs, monkeypatch):
             finally:
                 sys.setprofile(None)
 
-        result = compiled(name, lowered, modules)
+        result = compiled(name, label, lowered, modules)
         found[name[:60]] = {x for x in seen if x.startswith(PACKAGES) and Path(x) not in known}
         return result
 

@@ -466,8 +466,7 @@ def test_a_tuning_s_limits_and_numbers():
         "- all: peak_voltage at most 30 (active, 1.00 % left); gain_margin at least 1.5 "
         "(inactive, 58.33 % left)",
         "Those of the loop: on the nominal machine, the only one of the tuning.",
-        "worst disagreement is 1.5e-06 (of peak_voltage by control.gain_factor, at the best "
-        "design), below 0.0001.",
+        "worst disagreement is 1.5e-06 (of peak_voltage by control.gain_factor), below 0.0001.",
         "Ended after all 20 iterations",
     ):
         assert part in words, part
@@ -509,7 +508,7 @@ def test_placements_are_shown_in_millimetres_along_each_link():
     for i, row in enumerate(centers):
         assert table[f"centres on link {i + 1} [mm]"][1] == ", ".join(f"{x:.1f}" for x in row)
         assert 0 < row.min() < row.max() < 200
-    assert "placement[" not in text and "(of objective by placement," in text
+    assert "placement[" not in text and "(of objective by placement)," in text
 
 
 def test_a_tuning_s_summary_and_recommendation():
