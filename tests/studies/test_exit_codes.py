@@ -302,9 +302,12 @@ def test_a_replay_that_ends_otherwise_fails(capsys, monkeypatch, stored, wanted)
     code, text, _ = run(capsys, "replay", "folder", "--case", "1")
     assert code == wanted and "this: ok" in text
     assert ("CAUTION: the sweep and this run end differently." in text) == bool(wanted)
-    assert ("largest relative difference of a metric: 1.0e-07 (peak_error)" in text) == (
-        stored is not None
-    )
+    told = "largest relative difference of a metric: 1.0e-07 (residual_rms)"
+    assert (told in text) == (stored is not None)
+    found["gain_margin"] = (0.5, 0.02)
+    code, text, _ = run(capsys, "replay", "folder", "--case", "1")
+    told = "CAUTION: gain_margin differs by 50 %; allowed: 2 %."
+    assert (code == 1 and told in text) == (stored is not None)
 
 
 @pytest.mark.parametrize("is_passed", [True, False])
