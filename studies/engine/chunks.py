@@ -120,12 +120,14 @@ class LocalRunner:
                     future.result().first.cancel()
 
 
-def run_quietly(table: CaseTable, groups: list[Group]) -> Iterator[Done]:
-    """Chunks of groups, run here without a word."""
+def run_quietly(
+    table: CaseTable, groups: list[Group], stop: threading.Event | None = None
+) -> Iterator[Done]:
+    """Chunks of groups, run here without a word, until `stop` is set."""
     count = sum(len(group.rows) for group in groups)
     with Phases(Console(quiet=True), ("compile", "run"), is_quiet=True) as phases:
         reporter = Reporter(phases, "run", count, 0, len(groups))
-        for done in LocalRunner().run(table, groups, reporter, threading.Event()):
+        for done in LocalRunner().run(table, groups, reporter, stop or threading.Event()):
             assert isinstance(done, Done)  # only workers of a cluster give chunks up
             yield done
 

@@ -151,12 +151,6 @@ def _case_number(data: SweepData, case: str | None, path: Path) -> int:
     return int(case)
 
 
-def deviation(run: Run, stored: dict[str, np.ndarray]) -> tuple[float, str]:
-    """Largest of `deviations` of metrics, and of which one; (0, "") if there is none."""
-    found = ((x[0], name) for name, x in deviations(run, stored).items() if name in METRICS)
-    return max(found, default=(0.0, ""))
-
-
 def deviations(run: Run, stored: dict[str, np.ndarray]) -> dict[str, tuple[float, float]]:
     """Differences between what a run has found and what a sweep has kept of the same case.
 

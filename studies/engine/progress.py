@@ -42,7 +42,7 @@ class Phases:
         self._title = ""
 
     def __enter__(self) -> Phases:
-        config.shows_phases = True
+        self._outer, config.shows_phases = config.shows_phases, True
         if self.console.is_jupyter and not self.is_quiet:
             from IPython.display import display  # which is there in a notebook
 
@@ -65,7 +65,7 @@ class Phases:
         return time.perf_counter() - self._started
 
     def __exit__(self, *_: object) -> None:
-        config.shows_phases = False
+        config.shows_phases = self._outer  # of a command that this is a part of
         if self._bar is not None:
             self._bar.stop()
 

@@ -8,11 +8,9 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from rich.console import Console
 
-from studies.engine.chunks import Done, LocalRunner
+from studies.engine.chunks import Done, run_quietly
 from studies.engine.plan import local_layout, most_lanes, plan_groups
-from studies.engine.progress import Phases, Reporter
 from studies.engine.results import SweepData, counted_links, direction
 from studies.engine.screen import chunk_values
 from studies.engine.stored import accurate, inaccurate
@@ -225,14 +223,11 @@ def shard_tally(
         table, np.arange(count), lay_out, (screen.metric,), is_linear, is_judged=False
     )
     n_run = 0
-    with Phases(Console(quiet=True), ("compile", "run"), is_quiet=True) as phases:
-        reporter = Reporter(phases, "run", count, 0, len(groups))
-        for done in LocalRunner().run(table, groups, reporter, stop):
-            assert isinstance(done, Done)  # only workers of a cluster give chunks up
-            part = _chunk_tally(screen, table, done)
-            total = merged(total, part, *screen.ranking)
-            n_run += part.n_designs
-            on_endings(part.endings)
+    for done in run_quietly(table, groups, stop):
+        part = _chunk_tally(screen, table, done)
+        total = merged(total, part, *screen.ranking)
+        n_run += part.n_designs
+        on_endings(part.endings)
     return total if n_run == count else None
 
 

@@ -6,7 +6,6 @@ as arrays with a description of how they nest, so that reading them runs no code
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 from studies.engine.poles import PoleReport
 from studies.publish import replacing
 from studies.reading import read_npz
+from studies.store import numbers_digest
 from studies.tuning.audit import Disagreement
 from studies.tuning.check import JudgedDesign, OwnRun, RandomSearch
 from studies.tuning.loop_figures import DesignFigures
@@ -49,11 +49,12 @@ class KeptPhases:
             at: where the descent ended; results of another end are not used.
         """
         self._path = folder / FILE
-        self._end = hashlib.sha256(at.best_place.tobytes() + bytes(at.iteration)).hexdigest()
+        self._end = numbers_digest({"place": at.best_place, "iteration": at.iteration})
         self._found: dict[str, Any] = {}
         try:
             arrays = read_npz(self._path)
-            if str(arrays.pop("end")) == self._end and str(arrays.pop("digest")) == _digest(arrays):
+            end, digest = (str(arrays.pop(name)) for name in ("end", "digest"))
+            if end == self._end and digest == numbers_digest(arrays):
                 self._found = unpacked(json.loads(str(arrays.pop("form"))), arrays)
         except (OSError, ValueError, KeyError, TypeError):
             pass  # not there or damaged: the phases run again
@@ -64,17 +65,10 @@ class KeptPhases:
             self._found[name] = make()
             arrays: dict[str, np.ndarray] = {}
             arrays["form"] = np.array(json.dumps(packed(self._found, arrays)))
-            whole: Any = {**arrays, "digest": _digest(arrays), "end": self._end}
+            whole: Any = {**arrays, "digest": numbers_digest(arrays), "end": self._end}
             with replacing(self._path) as temporary, temporary.open("wb") as file:
                 np.savez(file, allow_pickle=False, **whole)
         return self._found[name]
-
-
-def _digest(arrays: Mapping[str, np.ndarray]) -> str:
-    whole = hashlib.sha256()
-    for name in sorted(arrays):
-        whole.update(name.encode() + np.ascontiguousarray(arrays[name]).tobytes())
-    return whole.hexdigest()
 
 
 def packed(value: Any, arrays: dict[str, np.ndarray]) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from studies import config
 from studies.engine import progress
 from studies.engine.progress import Phases, Reporter, duration_text
 from tests.canonical import TINY, text_of
@@ -117,3 +118,14 @@ def test_a_first_command_says_at_once_what_it_waits_for(tmp_path):
             assert waited < 10 and "the first commands on a machine compile" in first
             assert "compiling simulate" in told[0] and "compiling loops" in told[0]
     assert "compiling" not in told[1]
+
+
+def test_a_part_of_a_command_with_phases_leaves_them_shown():
+    """What is compiled after it is announced by the command's own phases."""
+    console = Console(file=io.StringIO())
+    assert not config.shows_phases
+    with Phases(console, NAMES):
+        with Phases(console, NAMES, is_quiet=True):
+            assert config.shows_phases
+        assert config.shows_phases
+    assert not config.shows_phases

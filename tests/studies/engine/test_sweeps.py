@@ -21,9 +21,10 @@ from rich.console import Console
 
 import studies
 from jaxmodel import status
+from jaxmodel.metrics import METRICS
 from studies.engine import chunks, function, plan
 from studies.engine import sweep as run_module
-from studies.engine.design import deviation, load_design
+from studies.engine.design import deviations, load_design
 from studies.engine.folder import (
     CHUNKS,
     SweepFolder,
@@ -74,6 +75,12 @@ def mixed(tmp_path_factory):
     outcome = run(noisy_spec(), out)
     assert outcome.n_done == outcome.n_run == 72
     return out, len(TRACES) - before
+
+
+def deviation(run, stored):
+    """Largest of the deviations of metrics, and of which one; (0, "") if there is none."""
+    found = ((x[0], name) for name, x in deviations(run, stored).items() if name in METRICS)
+    return max(found, default=(0.0, ""))
 
 
 def arrays(folder):
