@@ -26,9 +26,10 @@ def critical_force(plant: Plant) -> Array:
     """
     if plant.shortening is None:
         return jnp.full(plant.length.shape, jnp.inf)
+    stiffness = plant.stiffness[:, : plant.shortening.shape[1]]
     if plant.mixed_shortening is None:
-        return jnp.min(plant.stiffness / plant.shortening, axis=1)
-    scale = 1 / jnp.sqrt(plant.stiffness)
+        return jnp.min(stiffness / plant.shortening, axis=1)
+    scale = 1 / jnp.sqrt(stiffness)
     softness = scale[:, :, None] * chord_slopes(plant) * scale[:, None, :]
 
     def square(power: Array, _: None) -> tuple[Array, None]:
@@ -88,6 +89,18 @@ def axial_force(
     return motion.axial
 
 
+def held_coordinates(plant: Plant, force: Array) -> Array:
+    """Coordinates of straight links that lengthen under tensions [m], (3, R + 1).
+
+    Args:
+        plant: whose links lengthen.
+        force: N [N], (3,).
+    """
+    assert plant.stretch is not None
+    still = jnp.zeros_like(plant.stiffness)
+    return still.at[:, -1].set(plant.stretch * force / plant.stiffness[:, -1])
+
+
 def lumping_error(
     plant: Plant, basis: ModalBasis, pose: Array, pose_rate: Array, pose_acc: Array
 ) -> Array:
@@ -114,7 +127,7 @@ def lumping_error(
         left_out[:, :, 0] * slide[:, None]
         - basis.centrifugal[:, :, 0] * chain.beta_rate[:, None] ** 2
     )
-    return jnp.max(jnp.abs(force) / plant.stiffness, axis=1)
+    return jnp.max(jnp.abs(force) / basis.stiffness, axis=1)
 
 
 def axial_compliance(machine: Machine) -> Array:

@@ -21,7 +21,7 @@ import numpy as np
 
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array, Beam, Patches
-from jaxmodel.piezo import bare_stiffness, patch_ends
+from jaxmodel.piezo import bare_stiffness, opposite_gain, patch_ends
 from jaxmodel.static import (
     Pieces,
     bent_at,
@@ -102,10 +102,10 @@ def build_basis(
     def one_link(beam_i: Beam, patches_i: Patches, stations_i: Array) -> ModalBasis:
         return BASES[kind].modes(beam_i, patches_i, n_modes, stations_i)
 
-    return mask_modes(jax.vmap(one_link)(*_by_link(beam, patches, stations)), mode_mask)
+    return mask_modes(jax.vmap(one_link)(*by_link(beam, patches, stations)), mode_mask)
 
 
-def _by_link(beam: Beam, patches: Patches, stations: Array) -> tuple[Beam, Patches, Array]:
+def by_link(beam: Beam, patches: Patches, stations: Array) -> tuple[Beam, Patches, Array]:
     """Data of the links with a leading axis, one value per link."""
     centers, stations = jnp.asarray(patches.center), jnp.asarray(stations)
     n_links = len(centers)
@@ -153,7 +153,7 @@ def left_out_of_loads(
         As `static_loads` of each link, less the share of the modes, (3, 2 K + S, S + 2).
     """
     loads = partial(static_loads, has_patches=BASES[kind].has_patches)
-    exact = jax.vmap(loads)(*_by_link(beam, patches, stations))
+    exact = jax.vmap(loads)(*by_link(beam, patches, stations))
     slopes = [jnp.swapaxes(x, 1, 2) for x in (basis.sensor_slope, basis.actuator_slope)]
     seen = jnp.concatenate([slopes[0], basis.deflection_at, slopes[1]], axis=1)
     forces = [jnp.swapaxes(basis.deflection_at, 1, 2), basis.b[..., None], basis.c[..., None]]
@@ -207,7 +207,7 @@ def _pinned_pinned(beam: Beam, patches: Patches, n_modes: int, stations: Array) 
     line_mass, mass, moment, inertia = _rigid(beam)
     sign = jnp.where(order % 2 == 1, 1.0, -1.0)  # -cos(j pi)
     stiffness = bare_stiffness(beam) * beam.stiffness_factor * wave**4 * beam.length / 2
-    static = static_bending(beam, patches, stations, has_patches=False)
+    slopes, bent = static_bending(beam, patches, stations, has_patches=False)
 
     def slope(x: Array) -> Array:
         return wave[:, None] * jnp.cos(wave[:, None] * x)
@@ -228,8 +228,8 @@ def _pinned_pinned(beam: Beam, patches: Patches, n_modes: int, stations: Array) 
         deflection_at=jnp.sin(wave * stations[:, None]),
         sensor_slope=_slope_difference(slope, patches, patches.sensor_length),
         actuator_slope=_slope_difference(slope, patches, patches.actuator_length),
-        static_slope=static.slope,
-        static_deflection=static.deflection,
+        static_slope=slopes,
+        static_deflection=bent,
     )
 
 
@@ -253,7 +253,7 @@ def _pinned_free(beam: Beam, patches: Patches, n_modes: int, stations: Array) ->
     wave = root / beam.length
     line_mass, mass, moment, inertia = _rigid(beam)
     sine, scale = jnp.sin(root), 1 - jnp.exp(-2 * root)
-    static = static_bending(beam, patches, stations, has_patches=False)
+    slopes, bent = static_bending(beam, patches, stations, has_patches=False)
 
     def shape(x: Array) -> Array:
         up, down = jnp.exp(wave * (x - beam.length)), jnp.exp(-wave * (x + beam.length))
@@ -280,8 +280,8 @@ def _pinned_free(beam: Beam, patches: Patches, n_modes: int, stations: Array) ->
         deflection_at=jax.vmap(shape)(stations) - (stations / beam.length)[:, None],
         sensor_slope=_slope_difference(slope, patches, patches.sensor_length),
         actuator_slope=_slope_difference(slope, patches, patches.actuator_length),
-        static_slope=static.slope,
-        static_deflection=static.deflection,
+        static_slope=slopes,
+        static_deflection=bent,
     )
 
 
@@ -398,7 +398,7 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
         jnp.sum(line * (right - rest), axis=0),
         jnp.sum(line * (right**2 - rest**2) / 2, axis=0),
     )
-    static = static_bending(beam, patches, stations, has_patches=True)
+    slopes, bent = static_bending(beam, patches, stations, has_patches=True)
     x = xi * length
     return ModalBasis(
         mass=jnp.full((n_modes,), 0.5) * total_mass,
@@ -415,9 +415,13 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
         inertia=mass_w @ x**2 + jnp.sum(joint),
         deflection_at=shapes(stations / length).value @ coefficient,
         sensor_slope=_slope_difference(slope, patches, patches.sensor_length),
-        actuator_slope=_slope_difference(slope, patches, patches.actuator_length),
-        static_slope=static.slope,
-        static_deflection=static.deflection,
+        actuator_slope=_slope_difference(slope, patches, patches.actuator_length)
+        + opposite_gain(beam, patches)
+        * _slope_difference(
+            slope, patches, jnp.minimum(patches.sensor_length, patches.actuator_length)
+        ),
+        static_slope=slopes,
+        static_deflection=bent,
     )
 
 

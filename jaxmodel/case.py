@@ -27,6 +27,7 @@ class Structure(NamedTuple):
     basis: str = "pinned_pinned"  # of the plant
     has_shortening: bool = True  # bent links have shorter chords (none in basis pinned_free)
     is_distributed: bool = False  # every point of a bent link moves inwards, not half of it with C
+    has_stretch: bool = False  # links lengthen (in bases whose ends are on the chord)
     has_static_correction: bool = True  # static response of the modes that are left out
     is_coupled: bool = True  # False: kineto-elastodynamics, bending does not act back
     has_wrench: bool = False  # force and moment on the platform
@@ -57,6 +58,11 @@ class Structure(NamedTuple):
     def n_pose(self) -> int:
         """Coordinates of the platform."""
         return MECHANISMS[self.mechanism].n_pose
+
+    @property
+    def n_coordinates(self) -> int:
+        """Coordinates of a link: its modes, and its elongation if it has one."""
+        return self.n_modes + self.has_stretch
 
     @property
     def n_sensors(self) -> int:

@@ -14,7 +14,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
 from jaxmodel.lazy import jnp
 from jaxmodel.linear import resting
-from jaxmodel.loop import Loop
+from jaxmodel.loop import Loop, coordinate_omega
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import loop_matrices
@@ -76,13 +76,13 @@ def changed_loop(
         change: of the machine.
 
     Returns:
-        transition matrix, (n, n), and omega of the changed links' modes [rad/s], (3, R).
+        transition matrix, (n, n), and omega of the changed links' coordinates [rad/s], (3, R).
     """
     case, late = changed_case(case, change), structure._replace(has_delay=True)
     loop = prepare(late._replace(is_smooth=True, feedback="sampled"), case).loop
     loop = _with_gains(loop, jnp.exp(change.sensor), jnp.exp(change.actuator))
     matrices = loop_matrices(late, case, loop, law, pose, resting(late, case))
-    return matrices.open + matrices.feedback, loop.omega
+    return matrices.open + matrices.feedback, coordinate_omega(loop)
 
 
 def _with_gains(loop: Loop, sensor: Array, actuator: Array) -> Loop:

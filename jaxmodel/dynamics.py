@@ -28,11 +28,28 @@ class Accelerations(NamedTuple):
 
 
 def shortening_row(plant: Plant, q: Array) -> Array:
-    """(S q)_j, shortening of the chord per modal coordinate [1], (3, R)."""
-    row = plant.shortening * q
+    """(S q)_j, shortening of the chord by bending per coordinate [1], (3, R), 0 of an elongation.
+
+    Of links that lengthen q has one coordinate more than there are modes.
+    """
+    if plant.shortening is None:
+        return jnp.zeros_like(q)
+    modes = q if plant.stretch is None else q[:, :-1]
+    row = plant.shortening * modes
     if plant.mixed_shortening is not None:
-        row = row + _times(plant.mixed_shortening, q)
-    return row
+        row = row + _times(plant.mixed_shortening, modes)
+    return (
+        row if plant.stretch is None else jnp.concatenate([row, jnp.zeros_like(q[:, -1:])], axis=1)
+    )
+
+
+def chord_row(plant: Plant, q: Array) -> Array:
+    """Shortening of the chord per coordinate by bending and elongation, S q - a [1], (3, R)."""
+    row = shortening_row(plant, q)
+    if plant.stretch is None:
+        return row
+    longer = plant.stretch[:, None] + jnp.zeros_like(q[:, -1:])
+    return jnp.concatenate([row[:, :-1], -longer], axis=1)
 
 
 def _times(matrix: Array, q: Array) -> Array:
@@ -41,7 +58,7 @@ def _times(matrix: Array, q: Array) -> Array:
 
 
 def modal_chain(plant: Plant, pose: Array, pose_rate: Array, q: Array, q_rate: Array) -> Chain:
-    """`close_chain` of the bent machine (4), (6): w = sum Y_j(L) q_j, d = 1/2 sum S_jk q_j q_k.
+    """`close_chain` of the bent machine (4), (6): w = sum Y_j(L) q_j, d = 1/2 sum S_jk q_j q_k - e.
 
     Args:
         plant: the machine.
@@ -53,10 +70,12 @@ def modal_chain(plant: Plant, pose: Array, pose_rate: Array, q: Array, q_rate: A
     if plant.tip is not None:
         tip, tip_rate = jnp.sum(plant.tip * q, axis=1), jnp.sum(plant.tip * q_rate, axis=1)
         return close_chain(plant, pose, pose_rate, Bend(tip, tip_rate))
-    if plant.shortening is None:
+    if _is_rigid(plant):
         return close_chain(plant, pose, pose_rate)
-    row = shortening_row(plant, q)
+    row = chord_row(plant, q)
     shorter, rate = jnp.sum(row * q, axis=1) / 2, jnp.sum(row * q_rate, axis=1)
+    if plant.stretch is not None:
+        shorter = shorter - plant.stretch * q[:, -1] / 2
     return close_chain(plant, pose, pose_rate, Bend(shortening=shorter, shortening_rate=rate))
 
 
@@ -168,7 +187,7 @@ def accelerations(
 
 def _is_rigid(plant: Plant) -> bool:
     """Whether bending leaves the distance between a link's joints unchanged."""
-    return plant.tip is None and plant.shortening is None
+    return plant.tip is None and plant.shortening is None and plant.stretch is None
 
 
 class _Swing(NamedTuple):
@@ -309,7 +328,7 @@ class _End(NamedTuple):
 def _release_end(
     plant: Plant, chain: Chain, still: _Joint, q: Array, pull: Array, spread: _Spread | None
 ) -> tuple[_End, _Joint]:
-    """Let the modes move C along f: by shortening of the chord (row S q) or by row Y_j(L).
+    """Let the modes move C along f: by shortening of the chord (`chord_row`) or by row Y_j(L).
 
     tau = sum row_j q_j'' adds to C'' along f, and a reaction N acts on the modes, -row_j N; along
     the chord it is the axial force. With g = T^t (sum row_j beta_j, -sum row_j c_j)/m,
@@ -318,7 +337,7 @@ def _release_end(
 
     D tau = g.C'' - B N - sum row_j pull_j,  D N = (W_ff - mu, W_fg).C'' + A tau + load_f.
     """
-    row, mu = (shortening_row(plant, q), plant.tip_mass) if plant.tip is None else (plant.tip, 0.0)
+    row, mu = (chord_row(plant, q), plant.tip_mass) if plant.tip is None else (plant.tip, 0.0)
     mass = plant.modal_mass[:, None]
     slid = chain.sine * jnp.sum(row * (plant.b / mass), axis=1)
     if spread is not None:

@@ -12,11 +12,11 @@ patch, for any law; those of forces on the joints [N] and of chord deflections [
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxmodel.axial import axial_force, chord_slopes
+from jaxmodel.axial import axial_force, chord_slopes, held_coordinates
 from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.controller import Controller
@@ -26,7 +26,7 @@ from jaxmodel.drives.contract import drive_gains
 from jaxmodel.dynamics import mass_matrix, platform_mass
 from jaxmodel.electronics import FASTEST
 from jaxmodel.estimator import responses
-from jaxmodel.kinematics import close_chain
+from jaxmodel.kinematics import Bend, Chain, close_chain
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import Loop
 from jaxmodel.notch import notch_response
@@ -42,21 +42,31 @@ _SUMMED = 500
 
 
 class PlantResponse(NamedTuple):
-    """The machine about rest, in normal coordinates of each link (modal masses 1)."""
+    """The machine about rest, in normal coordinates of each link (modal masses 1).
+
+    P ports of a link: the pose, and its elongation if links lengthen. They move its modes by two
+    motions: that of its chord's angle, and that of its near joint across it.
+    """
 
     mass: Array  # of the pose with straight links, (3, 3)
     damping: Array  # of the drive in the pose, (3, 3)
     stiffness: Array  # (3, 3)
+    # mass [kg], damping [N s/m] and stiffness [N/m] between a link's elongation and (pose,
+    # elongation), (3, 4) each; None: links keep their length, and ports are those of the pose
+    longer: tuple[Array, Array, Array] | None
     square: Array  # omega^2 of the modes of a link with held ends [1/s2], (3, R)
     decay: Array  # 2 zeta omega [1/s], (3, R)
-    enter: Array  # generalised force on the pose per modal acceleration, (3, 3, R)
-    leave: Array  # inertia force on a mode per pose acceleration, (3, 3, R)
+    port: Array  # these two per motion of each port [rad/m and 1], (3, 2, P)
+    enter: Array  # generalised force on the two per modal acceleration, (3, 2, R)
+    leave: Array  # inertia force on a mode per acceleration of the two, (3, 2, R)
+    push: Array  # force on an elongation per actuator volt [N/V], (3, K); None likewise
+    read: Array  # sensor volts per elongation [V/m], (3, K); None likewise
     sensor: Array  # sensor volts per modal coordinate, (3, K, R)
     actuator: Array  # modal force per actuator volt, (3, R, K)
     direct: Array  # sensor volts per actuator volt by modes that are left out, (3, K, K)
     deflection: Array  # from the chord at the stations per modal coordinate, (3, S, R)
     direct_deflection: Array  # the same per actuator volt by modes that are left out, (3, S, K)
-    slide: Array  # of the actuated joints per motion of the pose, (3, 3)
+    slide: Array  # of the actuated joints per motion of the pose, (3, P)
     period: Array  # T [s], ()
     antialias: Array  # [rad/s], ()
     highpass: Array | None  # of the patches [rad/s], None if there is none, ()
@@ -83,66 +93,93 @@ def plant_response(structure: Structure, case: Case, loop: Loop, pose: Array) ->
     """
     plant, drive, electronics = loop.plant, loop.drive, case.electronics
     pose = jnp.asarray(pose, loop.omega.dtype)
-    still = jnp.zeros_like(pose)
+    still, n = jnp.zeros_like(pose), len(pose)
+    axial, longer = None, plant.stretch
+    if structure.has_wrench:
+        axial = axial_force(plant, pose, still, still, case.load.wrench)
+    rest = pose
+    if longer is not None:
+        held = jnp.zeros_like(longer) if axial is None else held_coordinates(plant, axial)[:, -1]
+        rest = jnp.concatenate([pose, longer * held])
 
-    def rates(pose_rate: Array) -> tuple[Array, Array]:
-        chain = close_chain(plant, pose, pose_rate)
+    def moving(at: Array, rate: Array) -> Chain:
+        """The chain of straight links for (pose, elongations)."""
+        bend = None if longer is None else Bend(shortening=-at[n:], shortening_rate=-rate[n:])
+        return close_chain(plant, at[:n], rate[:n], bend)
+
+    def rates(rate: Array) -> tuple[Array, Array]:
+        chain = moving(rest, rate)
         return chain.rho_rate, chain.beta_rate
 
-    to_rho, to_beta = jax.jacfwd(rates)(still)  # (3 links, 3)
-    chain = close_chain(plant, pose, still)
+    chain = moving(rest, 0 * rest)
+    to_rho, to_beta = (_ports(x, n) for x in jax.jacfwd(rates)(0 * rest))  # (3 links, P)
     platform = mass_matrix(platform_mass(plant, chain.turn))
     swing = -plant.tip_mass * chain.chord * chain.sine
-    mass = platform + sum(
-        jnp.einsum("i,ip,iq->pq", *terms)
-        for terms in (
-            (plant.slider_link_mass, to_rho, to_rho),
-            (plant.inertia, to_beta, to_beta),
-            (swing, to_rho, to_beta),
-            (swing, to_beta, to_rho),
-        )
-    )
-    at_c, at_b, inertia = _from_chord(plant)
-    leave = to_beta[:, :, None] * at_c[:, None] - (
-        (chain.sine[:, None] * to_rho)[:, :, None] * at_b[:, None]
-    )
+    terms = [
+        (plant.slider_link_mass, to_rho, to_rho),
+        (plant.inertia, to_beta, to_beta),
+        (swing, to_rho, to_beta),
+        (swing, to_beta, to_rho),
+    ]
     gains = drive_gains(DRIVES[structure.drive], drive)
     slope = gains.rate + drive.viscous_friction
     if structure.has_friction:
         slope = slope + drive.coulomb_friction / drive.friction_speed
-    stiffness = jnp.einsum("i,ip,iq->pq", gains.position, to_rho, to_rho)
+    damping, stiffness = _by_ports(slope, to_rho, to_rho), _by_ports(gains.position, to_rho, to_rho)
+    if axial is not None:
+        held = jnp.linalg.solve(to_rho[:, :n].T, -case.load.wrench)
+        curved = jax.jacfwd(jax.jacrev(lambda x: held * moving(x, 0 * x).rho))(rest)
+        by_row = jnp.swapaxes(_ports(jnp.swapaxes(curved, 1, 2), n), 1, 2)
+        stiffness = stiffness - _ports(by_row, n)
     modal_mass = plant.modal_mass[:, None]
-    springs = None
-    if structure.has_wrench:
-        held = jnp.linalg.solve(to_rho.T, -case.load.wrench)
-        curved = jax.hessian(lambda x: jnp.sum(held * close_chain(plant, x, still).rho))(pose)
-        stiffness = stiffness - curved
-        axial = axial_force(plant, pose, still, still, case.load.wrench)
-        springs = axial[:, None, None] * chord_slopes(plant)
-    modes = _normal_modes(plant, inertia, springs)
+    if longer is not None:
+        own = jnp.zeros_like(to_rho).at[:, n].set(1.0)
+        slid = plant.tip_mass * chain.cosine
+        terms += [
+            (plant.modal_mass / longer**2, own, own),
+            (slid, own, to_rho),
+            (slid, to_rho, own),
+        ]
+        damping = damping + _by_ports(plant.damping[:, -1] / longer**2, own, own)
+        stiffness = stiffness + _by_ports(plant.stiffness[:, -1] / longer**2, own, own)
+        modes = plant.stiffness.shape[1] - 1
+        parts = {x: getattr(plant, x)[:, :modes] for x in ("stiffness", "damping", "b", "c")}
+        plant = plant._replace(stretch=None, **parts)
+    mass = sum(_by_ports(*term) for term in terms)
+    at_c, at_b, inertia = _from_chord(plant)
+    leave = jnp.stack([at_c, -at_b], axis=1)
+    springs = None if axial is None else axial[:, None, None] * chord_slopes(plant)
+    square, modes = _normal_modes(plant, inertia, springs)
     leave = leave / modal_mass[:, None]
     decay = plant.damping / modal_mass
-    sensor, actuator, deflection = loop.sensor, loop.actuator, loop.deflection_at
-    if modes.shape is not None:
+    count = decay.shape[1]
+    sensor, deflection = loop.sensor[..., :count], loop.deflection_at[..., :count]
+    actuator = loop.actuator[:, :count]
+    if modes is not None:
         leave, sensor, deflection = (
-            jnp.einsum("ipr,irs->ips", x, modes.shape) for x in (leave, sensor, deflection)
+            jnp.einsum("ipr,irs->ips", x, modes) for x in (leave, sensor, deflection)
         )
-        actuator = jnp.einsum("irk,irs->isk", actuator, modes.shape)
-        decay = jnp.einsum("irs,ir,irs->is", modes.shape, decay, modes.shape)
+        actuator = jnp.einsum("irk,irs->isk", actuator, modes)
+        decay = jnp.einsum("irs,ir,irs->is", modes, decay, modes)
     enter = leave * modal_mass[:, None]
     if not structure.is_coupled:
         enter = jnp.zeros_like(enter)
-    left_out, n = loop.left_out, structure.n_patches
-    shape = (len(deflection), deflection.shape[1], n)
-    direct = jnp.zeros((len(deflection), n, n), mass.dtype)
+    left_out, n_patches = loop.left_out, structure.n_patches
+    shape = (len(deflection), deflection.shape[1], n_patches)
+    direct = jnp.zeros((len(deflection), n_patches, n_patches), mass.dtype)
+    whole = (mass, damping, stiffness)
     return PlantResponse(
-        mass=mass,
-        damping=jnp.einsum("i,ip,iq->pq", slope, to_rho, to_rho),
-        stiffness=stiffness,
-        square=modes.square,
+        mass=platform + jnp.sum(mass[:, :n, :n], axis=0),
+        damping=jnp.sum(damping[:, :n, :n], axis=0),
+        stiffness=jnp.sum(stiffness[:, :n, :n], axis=0),
+        longer=None if longer is None else tuple(x[:, n] for x in whole),
+        square=square,
         decay=decay,
+        port=jnp.stack([to_beta, chain.sine[:, None] * to_rho], axis=1),
         enter=enter,
         leave=leave,
+        push=None if longer is None else loop.actuator[:, -1] * modal_mass / longer[:, None],
+        read=None if longer is None else loop.sensor[..., -1] / longer[:, None],
         sensor=sensor,
         actuator=actuator,
         direct=direct if left_out is None else left_out.sensor,
@@ -155,6 +192,19 @@ def plant_response(structure: Structure, case: Case, loop: Loop, pose: Array) ->
         lag=electronics.amplifier_lag if structure.has_amplifier else None,
         delay=true_delay(electronics) if structure.has_delay else None,
     )
+
+
+def _ports(x: Array, n: int) -> Array:
+    """Of each link (first axis) the entries of the pose and of its own elongation, (3, ., P)."""
+    if x.shape[-1] == n:
+        return x
+    own = jnp.stack([x[i, ..., n + i] for i in range(len(x))])
+    return jnp.concatenate([x[..., :n], own[..., None]], axis=-1)
+
+
+def _by_ports(weight: Array, one: Array, other: Array) -> Array:
+    """weight one other' of each link, (3, P, P)."""
+    return weight[:, None, None] * one[:, :, None] * other[:, None]
 
 
 def _from_chord(plant: Plant) -> tuple[Array, Array, Array | None]:
@@ -177,28 +227,59 @@ def _from_chord(plant: Plant) -> tuple[Array, Array, Array | None]:
     return c, b, eye - (mixed + jnp.swapaxes(mixed, 1, 2)) / 2
 
 
-class _NormalModes(NamedTuple):
-    """Of each link between held ends."""
+def _normal_modes(
+    plant: Plant, inertia: Array | None, springs: Array | None
+) -> tuple[Array, Array | None]:
+    """Modes of (modal inertia, stiffness with `springs` of axial forces [N/m], (3, R, R)).
 
-    square: Array  # omega^2 [1/s2], (3, R)
-    shape: Array | None  # in modal coordinates, of modal mass m, (3, R, R); None: themselves
-
-
-def _normal_modes(plant: Plant, inertia: Array | None, springs: Array | None) -> _NormalModes:
-    """Modes of (modal inertia, stiffness with `springs` of axial forces [N/m], (3, R, R))."""
+    Returns:
+        omega^2 of each link between held ends [1/s2], (3, R), and shapes in modal coordinates, of
+        modal mass m, (3, R, R); None: themselves.
+    """
     mass = plant.modal_mass[:, None]
     if inertia is None and (springs is None or plant.mixed_shortening is None):
         diagonal = 0.0 if springs is None else jnp.einsum("irr->ir", springs)
-        return _NormalModes((plant.stiffness + diagonal) / mass, None)
+        return (plant.stiffness + diagonal) / mass, None
     eye = jnp.eye(plant.stiffness.shape[1])
     stiffness = plant.stiffness[:, :, None] * eye + (0.0 if springs is None else springs)
     if inertia is None:
-        return _NormalModes(*jnp.linalg.eigh(stiffness / mass[:, None]))
+        return tuple(jnp.linalg.eigh(stiffness / mass[:, None]))
     half = jnp.linalg.inv(jnp.linalg.cholesky(inertia / mass[:, None]))
     square, shape = jnp.linalg.eigh(
         jnp.einsum("ijr,irs,iks->ijk", half, stiffness / mass[:, None], half)
     )
-    return _NormalModes(square, jnp.einsum("ikr,iks->irs", half, shape))
+    return square, jnp.einsum("ikr,iks->irs", half, shape)
+
+
+class Assembled(NamedTuple):
+    """The rigid part of a machine: p coordinates, the pose and then the links' elongations."""
+
+    mass: Array  # (p, p)
+    damping: Array  # (p, p)
+    stiffness: Array  # (p, p)
+    enter: Array  # generalised force on them per modal acceleration, (3, p, R)
+    leave: Array  # inertia force on a mode per acceleration of them, (3, p, R)
+
+
+def assembled(plant: Any, xp: Any = jnp) -> Assembled:
+    """Its matrices with all elongations at once.
+
+    Args:
+        plant: a `PlantResponse`, or what has its fields of the same names.
+        xp: NumPy or `jax.numpy`.
+    """
+    own = plant.mass, plant.damping, plant.stiffness
+    modes = [xp.swapaxes(plant.port, 1, 2) @ x for x in (plant.enter, plant.leave)]
+    if plant.longer is None:
+        return Assembled(*own, *modes)
+    links, n = len(plant.square), len(plant.mass)
+    place = np.zeros((links, n + 1, n + links))
+    place[:, :n, :n], place[np.arange(links), n, n + np.arange(links)] = np.eye(n), 1.0
+    whole = []
+    for pose, row in zip(own, plant.longer, strict=True):
+        side = xp.concatenate([row[:, :n].T, xp.diag(row[:, n])])
+        whole.append(xp.concatenate([xp.concatenate([pose, row[:, :n]]), side], axis=1))
+    return Assembled(*whole, *(xp.swapaxes(xp.swapaxes(x, 1, 2) @ place, 1, 2) for x in modes))
 
 
 # --- the spectrum's images ------------------------------------------------------------------------
@@ -254,8 +335,8 @@ class Images(NamedTuple):
 def plant_images(plant: PlantResponse, omega: Array, order: np.ndarray) -> Images:
     """Responses of the plant at s_n, without any delay.
 
-    A mode moves by q = (a u - s^2 l X)/(s^2 + 2 zeta omega s + omega^2), the pose by
-    Z X = J' F - s^2 sum e q with its dynamic stiffness Z.
+    A mode moves by q = (a u - s^2 l X)/(s^2 + 2 zeta omega s + omega^2), the ports by
+    Z X = p u + J' F - s^2 sum e q with their dynamic stiffness Z; elongations are eliminated.
 
     Args:
         plant: of the machine.
@@ -279,27 +360,50 @@ def plant_images(plant: PlantResponse, omega: Array, order: np.ndarray) -> Image
         return jnp.einsum("iar,nir,ibr->niab", one, mobile, other)
 
     act = jnp.swapaxes(plant.actuator, 1, 2)
-    coupled = jnp.sum(through(plant.enter, plant.leave), axis=1)
-    at = (slice(None), None, None)
+    at, each, n = (slice(None), None, None), (slice(None), None, None, None), len(plant.mass)
+    onto, port = jnp.swapaxes(plant.port, 1, 2), plant.port
+    taken = (s2 * s2)[each] * (onto @ through(plant.enter, plant.leave) @ port)  # (I, 3, P, P)
+    entering = s2[each] * (onto @ through(plant.enter, act))  # (I, 3, P, K)
     stiffness = s2[at] * plant.mass + s[at] * plant.damping + plant.stiffness
-    compliance = _inverse(stiffness - (s2 * s2)[at] * coupled)
-    entering = s2[at] * _side_by_side(through(plant.enter, act))  # (I, 3, 3 K)
+    stiffness = stiffness - jnp.sum(taken[:, :, :n, :n], axis=1)
+    force, long = jnp.broadcast_to(plant.slide[:, :n], taken.shape[:2] + (n,)), None
+    if plant.longer is not None:  # elongations follow the pose and their own forces
+        mass, damping, spring = plant.longer
+        row = s2[at] * mass + s[at] * damping + spring - taken[:, :, n]
+        share, soft = row[..., :n] / row[..., n:], 1 / row[..., n]
+        stiffness = stiffness - jnp.einsum("nip,niq->npq", share, row[..., :n])
+        pushed = entering[:, :, n] - plant.push  # (I, 3, K)
+        entering = entering[:, :, :n] - share[..., None] * pushed[:, :, None]
+        force = force - share * plant.slide[:, n:]
+        long = share, soft[..., None, None] * pushed[:, :, None], soft * plant.slide[:, n]
+    compliance = _inverse(stiffness)
+    entering, force = _side_by_side(entering), jnp.swapaxes(force, 1, 2)
 
-    def outputs(rows: Array, direct: Array, gain: Array) -> tuple[Array, Array]:
+    def outputs(rows: Array, direct: Array, read: Array | None, gain: Array) -> tuple[Array, Array]:
         """By commands and by forces, for outputs that are rows over the modes."""
-        leaving = s2[at] * _stacked(through(rows, plant.leave)) @ compliance  # (I, 3 m, 3)
-        own = _block_diagonal(through(rows, act) + direct)
-        by_force = leaving @ (plant.slide.T + 0j)
-        return (gain * driven)[at] * (own + leaving @ entering), -(gain * held)[at] * by_force
+        leaving = s2[each] * (through(rows, plant.leave) @ port)  # (I, 3, m, P)
+        own, by_force = through(rows, act) + direct, 0.0
+        if long is not None:
+            share, by_voltage, by_joint = long
+            seen = leaving[..., n:] - (0.0 if read is None else read[..., None])
+            own = own + seen * by_voltage
+            by_force = _block_diagonal(seen * by_joint[..., None, None])
+            leaving = leaving[..., :n] - seen * share[:, :, None]
+        leaving = _stacked(leaving) @ compliance  # (I, 3 m, p)
+        by_force = leaving @ force + by_force
+        return (gain * driven)[at] * (_block_diagonal(own) + leaving @ entering), -(gain * held)[
+            at
+        ] * by_force
 
-    sensed, disturbed = outputs(plant.sensor, plant.direct, seen)
-    return Images(sensed, disturbed, *outputs(plant.deflection, jnp.zeros(()), jnp.ones_like(s)))
+    sensed, disturbed = outputs(plant.sensor, plant.direct, plant.read, seen)
+    bent, pushed = outputs(plant.deflection, jnp.zeros(()), None, jnp.ones_like(s))
+    return Images(sensed, disturbed, bent, pushed)
 
 
 def _inverse(matrix: Array) -> Array:
     """Of matrices (..., n, n), n = 2 or 3."""
     if matrix.shape[-1] == 2:
-        (a, b), (c, d) = ((matrix[..., i, j] for j in range(2)) for i in range(2))
+        a, b, c, d = (matrix[..., i, j] for i in range(2) for j in range(2))
         turned = jnp.stack([jnp.stack([d, -b], axis=-1), jnp.stack([-c, a], axis=-1)], axis=-2)
         return turned / (a * d - b * c)[..., None, None]
     rows = [matrix[..., k, :] for k in range(3)]

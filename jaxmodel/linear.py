@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxmodel.axial import axial_force, held_coordinates
 from jaxmodel.case import Case, Structure
 from jaxmodel.drive import Reference, slider_force
 from jaxmodel.drives import DRIVES
@@ -25,7 +26,7 @@ from jaxmodel.parameters import Array
 class LinearPlant(NamedTuple):
     """x' = A x + B_voltage V_a + B_force F; outputs are rows that multiply x, or V_a."""
 
-    state: Array  # A [1/s and mixed], (n, n), n = 6 + 6 R
+    state: Array  # A [1/s and mixed], (n, n), n = 6 + 6 (coordinates of a link)
     voltage: Array  # B_voltage, (n, 3 K)
     force: Array  # B_force, disturbance on the actuated joints, (n, 3)
     deflection: Array  # chord deflection at the stations [m], (3 S, n)
@@ -45,7 +46,7 @@ def flatten(state: PlantState) -> Array:
 def unflatten(x: Array, structure: Structure) -> PlantState:
     """Inverse of `flatten`."""
     n = structure.n_pose
-    modes = jnp.reshape(x[2 * n :], (2, structure.n_links, structure.n_modes))
+    modes = jnp.reshape(x[2 * n :], (2, structure.n_links, structure.n_coordinates))
     return PlantState(x[:n], x[n : 2 * n], *modes)
 
 
@@ -90,8 +91,13 @@ def linearise(
     still = jnp.zeros_like(pose)
     rate = still if moment is None else jnp.asarray(moment.rate, pose.dtype)
     chain = close_chain(loop.plant, pose, rate)
-    zero = jnp.zeros_like(loop.omega)
-    rest = flatten(PlantState(pose, rate, zero, zero))
+    zero = jnp.zeros_like(loop.plant.stiffness)
+    held_q = zero
+    if loop.plant.stretch is not None and moment is not None:
+        force = axial_force(loop.plant, pose, rate, moment.acceleration, moment.wrench)
+        held_q = held_coordinates(loop.plant, force)
+        chain = modal_chain(loop.plant, pose, rate, held_q, zero)
+    rest = flatten(PlantState(pose, rate, held_q, zero))
     has_feedforward = DRIVES[structure.drive].has_feedforward or structure.has_wrench
     reference = Reference(
         rho=chain.rho,
@@ -147,7 +153,7 @@ def linearise(
 
 def _rows(matrix: Array, structure: Structure) -> Array:
     """Per-link outputs of q, (3, m, R), as rows over x."""
-    rates = structure.n_links * structure.n_modes
+    rates = structure.n_links * structure.n_coordinates
     return jnp.pad(_diagonal(matrix), ((0, 0), (2 * structure.n_pose, rates)))
 
 
@@ -178,7 +184,7 @@ def mass_and_stiffness(loop: Loop, pose: Array, plant: LinearPlant) -> tuple[Arr
     Returns:
         (M, K): [kg and mixed] and [N/m and mixed], symmetric, (m, m) with m = 3 + 3 R.
     """
-    rest = jnp.zeros_like(loop.omega)
+    rest = jnp.zeros_like(loop.plant.stiffness)
     count = len(pose)
     size = count + rest.size
 

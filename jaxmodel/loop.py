@@ -62,6 +62,18 @@ class Loop(NamedTuple):
     delayed: Delayed | None = None  # None: commands are held from sample to sample, one later
     hysteresis: Hysteresis | None = None  # of the actuators; None: they are linear
     rest: Rest | None = None  # about which the linear model is taken; None: the full model
+    # omega^2 [1/s2] and decay [1/s] of the elongations' oscillators in `exponential`, less those of
+    # links alone, (3,) each; None: links keep their length
+    split: tuple[Array, Array] | None = None
+
+
+def coordinate_omega(loop: Loop) -> Array:
+    """Frequencies of a link's coordinates [rad/s]: its modes, then its elongation if it has one."""
+    if loop.split is None:
+        return loop.omega
+    plant = loop.plant
+    own = jnp.sqrt(loop.split[0] + plant.stiffness[:, -1] / plant.modal_mass)
+    return jnp.concatenate([loop.omega, own[:, None]], axis=1)
 
 
 class Delayed(NamedTuple):
@@ -224,6 +236,20 @@ def linear_rates(
     return rates._replace(acceleration=rates.acceleration._replace(coupling=coupling, modal=modal))
 
 
+def _split_rates(
+    structure: Structure, loop: Loop, state: PlantState, reference: Reference, voltage: Array
+) -> Rates:
+    """Rates whose `coupling` leaves out the oscillators of `Loop.exponential`."""
+    model = plant_rates if loop.rest is None else linear_rates
+    rates = model(structure, loop, state, reference, voltage)
+    if loop.split is None:
+        return rates
+    coupling, (square, decay) = rates.acceleration.coupling, loop.split
+    more = coupling[:, -1] + square * state.q[:, -1] + decay * state.q_rate[:, -1]
+    coupling = jnp.concatenate([coupling[:, :-1], more[:, None]], axis=1)
+    return rates._replace(acceleration=rates.acceleration._replace(coupling=coupling))
+
+
 def ideal_voltage(structure: Structure, loop: Loop, q: Array, q_rate: Array) -> Array:
     """Actuator voltages [V] of continuous feedback (20) from noise-free sensors, (3, K)."""
     assert loop.ideal is not None
@@ -259,8 +285,8 @@ def plant_step(
     e, f = coefficients.half, coefficients.half_force
     start, middle, end = references
 
-    model = plant_rates if loop.rest is None else linear_rates
-    rates = jax.jit(partial(model, structure, loop))  # traced once, called four times
+    # traced once, called four times
+    rates = jax.jit(partial(_split_rates, structure, loop))
 
     def stage(
         origin: PlantState, x: tuple[Any, ...], slope: tuple[Any, ...], length: Array, push: Array
@@ -419,7 +445,7 @@ def advance(
         pose=plant.pose,
         pose_error=sample.pose_error,
         slider=chain.rho,
-        modal_coordinate=plant.q,
+        modal_coordinate=_modes(loop, plant.q),
         controlled_coordinate=sample.modal,
         chord_deflection_stations=sample.deflection,
         sensor_voltage=_raw_voltage(loop, plant, present),
@@ -473,6 +499,11 @@ def deflection(loop: Loop, q: Array, voltage: Array) -> Array:
     if loop.left_out is None:
         return modal
     return modal + jnp.sum(loop.left_out.deflection * voltage[:, None], axis=2)
+
+
+def _modes(loop: Loop, q: Array) -> Array:
+    """Coordinates of the modes alone, (3, R)."""
+    return q if loop.plant.stretch is None else q[:, :-1]
 
 
 def _raw_voltage(loop: Loop, plant: PlantState, voltage: Array) -> Array:
@@ -593,8 +624,8 @@ def _sample(
     is_full = jnp.any(jnp.abs(motors) >= loop.drive.force_limit * (1 - 1e-9), axis=0)
     return metrics.Sample(
         deflection=deflection(loop, plant.q, present),
-        q=plant.q,
-        q_rate=plant.q_rate,
+        q=_modes(loop, plant.q),
+        q_rate=_modes(loop, plant.q_rate),
         modal=jnp.sum(loop.observer * plant.q[:, None], axis=2),
         modal_rate=jnp.sum(loop.observer * plant.q_rate[:, None], axis=2),
         pose_error=plant.pose - inputs.pose,

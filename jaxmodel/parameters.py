@@ -57,6 +57,10 @@ class Patches(NamedTuple):
     bridge: Array = 2500.0  # amplified bridge voltage per relative change of resistance [V]
     gauge_noise: Array = 0.0  # of the bridge's amplifier, rms [V]
     hysteresis: Array = 0.0  # width of the actuators' loop, see `jaxmodel.hysteresis` [1], ()
+    # 1: an actuator is a force at its distance from the section's own neutral axis, 0: a moment
+    # as if no sensor were opposite
+    is_force: Array = 0.0
+    is_paired: Array = 0.0  # 1: actuators on both faces, of opposite polarity; 0: on one
 
 
 class Damping(NamedTuple):
@@ -69,6 +73,7 @@ class Damping(NamedTuple):
     ratio: Array  # zeta by mode, the last one repeated where a link has fewer [1], (3, n)
     count: Array  # how many are given, (3,)
     exponent: Array  # p [1], ()
+    stretch: Array = 0.01  # zeta of longitudinal modes at 1.5 kHz, in proportion to frequency [1]
 
 
 class Machine(NamedTuple):

@@ -51,13 +51,30 @@ def two_sided_section(beam: Beam, patches: Patches) -> CrossSection:
     return CrossSection(stiffness, jnp.zeros_like(stiffness))
 
 
+def actuator_force(patches: Patches) -> Array:
+    """F = b_p E_p |d31| [N/V]: how hard an actuator pushes along its link per volt."""
+    return patches.width * patches.youngs_modulus * jnp.abs(patches.d31)
+
+
 def actuator_constant(beam: Beam, patches: Patches) -> Array:
     """lambda_a [N m/V] of (14): bending moment per volt of an actuator alone on its face.
 
-    lambda_a = b_p E_p |d31| ((t_b + t_p)/2 - z_n); polarity chosen so that it is positive.
+    lambda_a = F ((t_b + t_p)/2 - z_n); polarity chosen so that it is positive. Of a pair on both
+    faces F (t_b + t_p).
     """
-    arm = (beam.thickness + patches.thickness) / 2 - one_sided_section(beam, patches).neutral_axis
-    return patches.width * patches.youngs_modulus * jnp.abs(patches.d31) * arm
+    arm = (beam.thickness + patches.thickness) / 2
+    one = arm - one_sided_section(beam, patches).neutral_axis
+    return actuator_force(patches) * jnp.where(jnp.asarray(patches.is_paired) > 0, 2 * arm, one)
+
+
+def opposite_gain(beam: Beam, patches: Patches) -> Array:
+    """What an actuator's moment gains where a sensor stiffens the other face [1].
+
+    There the neutral axis is back in the middle: (t_b + t_p)/2 over (t_b + t_p)/2 - z_n.
+    """
+    arm = (beam.thickness + patches.thickness) / 2
+    gain = arm / (arm - one_sided_section(beam, patches).neutral_axis) - 1
+    return gain * patches.is_force * (1 - patches.is_paired) * (1 - patches.is_gauge)
 
 
 def sensor_capacitance(patches: Patches) -> Array:
@@ -78,8 +95,7 @@ def sensor_constant(beam: Beam, patches: Patches) -> Array:
     the actuator covers the other face, and the clamped capacitance C; of a strain gauge, see
     `gauge_constant`.
     """
-    arm = (beam.thickness + patches.thickness) / 2
-    charge = patches.width * patches.youngs_modulus * jnp.abs(patches.d31) * arm
+    charge = actuator_force(patches) * (beam.thickness + patches.thickness) / 2
     piezo = charge / sensor_capacitance(patches)
     return jnp.where(jnp.asarray(patches.is_gauge) > 0, gauge_constant(beam, patches), piezo)
 
@@ -91,8 +107,18 @@ def gauge_constant(beam: Beam, patches: Patches) -> Array:
     the shift of the neutral axis towards the actuator on the other face. With gauge factor k,
     excitation U, n active arms of four and gain g, V = U g (n/4) k strain (Hoffmann 1989).
     """
-    arm = beam.thickness / 2 + one_sided_section(beam, patches).neutral_axis
-    return patches.bridge * patches.gauge_factor * arm / patches.sensor_length
+    return patches.bridge * patches.gauge_factor * _gauge_arm(beam, patches) / patches.sensor_length
+
+
+def _gauge_arm(beam: Beam, patches: Patches) -> Array:
+    shift = one_sided_section(beam, patches).neutral_axis * (1 - patches.is_paired)
+    return beam.thickness / 2 + shift
+
+
+def sensor_arm(beam: Beam, patches: Patches) -> Array:
+    """Distance of a sensor from the section's neutral axis [m], see `sensor_constant`."""
+    piezo = (beam.thickness + patches.thickness) / 2
+    return jnp.where(jnp.asarray(patches.is_gauge) > 0, _gauge_arm(beam, patches), piezo)
 
 
 def patch_ends(center: Array, length: Array) -> tuple[Array, Array]:

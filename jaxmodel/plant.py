@@ -14,6 +14,7 @@ from jaxmodel.beam import ModalBasis
 from jaxmodel.lazy import jnp
 from jaxmodel.mechanisms.contract import Legs
 from jaxmodel.parameters import Array, Damping, Machine
+from jaxmodel.stretch import Stretch
 
 
 class Plant(NamedTuple):
@@ -42,6 +43,8 @@ class Plant(NamedTuple):
     centrifugal: Array | None  # Q_jk [kg], (3, R, R), None likewise
     b: Array  # [kg], (3, R)
     c: Array  # [kg m], (3, R)
+    # elongation of a link per last coordinate, which is no mode [1], (3,); None: no such one
+    stretch: Array | None = None
 
 
 def damping_ratio(damping: Damping, omega: Array) -> Array:
@@ -63,10 +66,12 @@ def build_plant(
     is_locked: Array = False,
     has_shortening: bool = True,
     is_distributed: bool = False,
+    stretch: Stretch | None = None,
 ) -> Plant:
     """Collect machine and basis into a `Plant`.
 
-    The payload adds its mass, inertia and first moment to the platform's.
+    The payload adds its mass, inertia and first moment to the platform's. Links that lengthen have
+    one coordinate more, of the modes' modal mass.
 
     Args:
         machine: physical description.
@@ -75,6 +80,7 @@ def build_plant(
         has_shortening: bent links have shorter chords (static); False: as in the paper.
         is_distributed: every point of a bent link moves inwards by its own amount (static); False:
             half of the link moves in with joint C.
+        stretch: of the links; None: they keep their length.
 
     Returns:
         Plant.
@@ -92,7 +98,7 @@ def build_plant(
     inertia = masses.platform_inertia + jnp.asarray(masses.payload_inertia)
     if offset is not None:
         inertia = inertia + payload * jnp.sum(jnp.asarray(offset) ** 2)
-    return Plant(
+    plant = Plant(
         legs=legs,
         joint_cos=None if arms is None else arms[0],
         joint_sin=None if arms is None else arms[1],
@@ -117,6 +123,27 @@ def build_plant(
         centrifugal=basis.centrifugal if has_shortening and is_distributed else None,
         b=basis.b,
         c=basis.c,
+    )
+    return plant if stretch is None else _lengthening(plant, stretch)
+
+
+def _lengthening(plant: Plant, stretch: Stretch) -> Plant:
+    scale = jnp.sqrt(plant.modal_mass / stretch.mass)
+
+    def beside(x: Array, value: Array = 0.0) -> Array:
+        return jnp.pad(x, ((0, 0), (0, 1))).at[:, -1].set(value)
+
+    def around(x: Array | None) -> Array | None:
+        return None if x is None else jnp.pad(x, ((0, 0), (0, 1), (0, 1)))
+
+    return plant._replace(
+        stiffness=beside(plant.stiffness, scale**2 * stretch.stiffness),
+        damping=beside(plant.damping, scale**2 * stretch.damping),
+        inward=around(plant.inward),
+        centrifugal=around(plant.centrifugal),
+        b=beside(plant.b),
+        c=beside(plant.c),
+        stretch=scale,
     )
 
 

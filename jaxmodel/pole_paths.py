@@ -42,7 +42,7 @@ def refine_open_loop_poles(
     response, held = constants
 
     def function(s: Pair, shift: Pair) -> Pair:
-        return evaluate_loop_gain(response, s, shift).pose_inverse.inverse()
+        return evaluate_loop_gain(response, s, shift).assembled
 
     return _improved(response, function, held, traced)
 

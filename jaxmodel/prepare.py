@@ -6,7 +6,7 @@ from functools import reduce
 from typing import NamedTuple
 
 from jaxmodel import shaper, status
-from jaxmodel.axial import axial_compliance
+from jaxmodel.axial import axial_compliance, axial_force, held_coordinates
 from jaxmodel.bases import Bases, find_bases
 from jaxmodel.beam import BASES, ModalBasis, pinned_free_roots
 from jaxmodel.case import Case, Drive, Structure
@@ -38,6 +38,7 @@ from jaxmodel.piezo import (
 )
 from jaxmodel.plant import Plant, build_plant, damping_ratio
 from jaxmodel.static import static_remainder
+from jaxmodel.stretch import Stretch, find_stretch, held_voltage
 
 #: Frequencies of the spectra lie within this fraction of the modal frequency [1].
 SPECTRUM_SPAN = 0.1
@@ -48,6 +49,10 @@ STIFFNESS_LIMIT = 2.5
 #: omega h of the highest mode of links whose ends are not on their chords: such modes are strongly
 #: coupled, which ETDRK4 integrates explicitly; 2e-4 of the bending at this limit [1].
 COUPLED_STEP_LIMIT = 1.5
+
+
+#: Fastest longitudinal mode of the machine over that of one link between slider and platform [1].
+STRETCHING = 1.5
 
 
 class Prepared(NamedTuple):
@@ -86,68 +91,125 @@ def prepare(structure: Structure, case: Case) -> Prepared:
     machine, electronics = case.machine, case.electronics
     bases = find_bases(structure, case)
     basis = bases.plant
+    stretch = stretch_of(structure, case)
     plant = build_plant(
-        machine, basis, case.drive.is_locked, structure.has_shortening, structure.is_distributed
+        machine,
+        basis,
+        case.drive.is_locked,
+        structure.has_shortening,
+        structure.is_distributed,
+        stretch,
     )
     design = design_controller(structure, case, bases)
     omega = jnp.sqrt(basis.stiffness / basis.mass)
-    zeta = plant.damping / (2 * basis.mass * omega)
+    split = _split(structure, case, plant, omega)
     step = electronics.period / structure.substeps
     change = command_change(true_delay(electronics)) if structure.is_delayed else None
     after = step if change is None else (1 - change.share) * step
     lambda_s, lambda_a = _constants(case)
     sensor = lambda_s[:, None, None] * jnp.swapaxes(basis.sensor_slope, 1, 2)
+    observer = jnp.einsum("ick,ikr->icr", design.nominal.observer, sensor)
+    actuator = lambda_a[:, None, None] * basis.actuator_slope / basis.mass[:, :, None]
+    deflection_at = basis.deflection_at
+    if stretch is not None:
+        scale = plant.stretch * stretch.stiffness
+        sensor = _beside(sensor, stretch.strain * scale[:, None], 2)
+        actuator = _beside(actuator, stretch.free * (scale / plant.modal_mass)[:, None], 1)
+        observer, deflection_at = (_beside(x, 0.0, 2) for x in (observer, deflection_at))
     angle = 2 * jnp.pi * electronics.period * spectrum_frequencies(structure, bases)
     loop = Loop(
         plant=plant,
         omega=omega,
-        exponential=_exponential(structure, case, omega, zeta, after),
+        exponential=_exponential(structure, case, split, after),
         plant_step=after,
         amplifier=_amplifier(structure, case, after),
         sensor=sensor,
-        actuator=lambda_a[:, None, None] * basis.actuator_slope / basis.mass[:, :, None],
-        deflection_at=basis.deflection_at,
+        actuator=actuator,
+        deflection_at=deflection_at,
         controller=design.controller,
         ideal=_ideal(design.controller.feedback, sensor) if structure.feedback == "ideal" else None,
-        observer=jnp.einsum("ick,ikr->icr", design.nominal.observer, sensor),
+        observer=observer,
         modal_omega=design.modal_omega,
         rotation=(jnp.cos(angle), jnp.sin(angle)),
         drive=_each_slider(case.drive),
-        axial_compliance=axial_compliance(machine),
+        axial_compliance=axial_compliance(machine) if stretch is None else 1 / stretch.stiffness,
         settling_band=jnp.asarray(case.windows.settling_band),
-        left_out=_left_out(structure, case, basis, after),
+        left_out=_left_out(structure, case, basis, stretch, after),
         hysteresis=_hysteresis(structure, case),
         rest=_rest(structure, case, plant) if structure.is_linear else None,
+        split=split[2],
     )
     if change is not None:
         until = change.share * step
         delayed = Delayed(
             before=change.before,
             after=change.after,
-            exponential=_exponential(structure, case, omega, zeta, until),
+            exponential=_exponential(structure, case, split, until),
             plant_step=until,
             amplifier=_amplifier(structure, case, until),
-            passage=_passage(structure, case, until) if structure.has_static_correction else None,
+            passage=None if loop.left_out is None else _passage(structure, case, until),
         )
         loop = loop._replace(delayed=delayed)
     return Prepared(
         loop=loop,
         bases=bases,
         taps=design_taps(case, bases),
-        initial_q=_initial_modes(structure, case, bases),
+        initial_q=_initial_coordinates(structure, case, bases, plant),
         sensor_condition=design.sensor_condition,
         actuator_condition=design.actuator_condition,
-        status=_static_status(structure, case, bases, design, omega * step, zeta),
+        status=_static_status(structure, case, bases, design, split, step),
     )
 
 
+def _beside(x: Array, value: Array, axis: int) -> Array:
+    """One more coordinate at the end of an axis, (3, ., .)."""
+    shape = (*x.shape[:axis], 1, *x.shape[axis + 1 :])
+    last = jnp.expand_dims(value, axis) if jnp.ndim(value) else jnp.full(shape, value)
+    return jnp.concatenate([x, last], axis=axis)
+
+
+def stretch_of(structure: Structure, case: Case) -> Stretch | None:
+    """Stretch of the links; None: they keep their length."""
+    if not structure.has_stretch:
+        return None
+    machine, basis = case.machine, BASES[structure.basis]
+    return find_stretch(machine.beam, machine.patches, machine.damping, basis.has_patches)
+
+
+def _split(structure: Structure, case: Case, plant: Plant, omega: Array) -> tuple[Array, ...]:
+    """Oscillators that plant steps solve exactly: modes as they are, elongations as assembled.
+
+    Between slider and platform an elongation vibrates at a fraction of the frequency of the link
+    alone, which has the smallest mass.
+
+    Returns:
+        omega [rad/s], zeta [1], (3, coordinates) each, and `Loop.split`.
+    """
+    mass = plant.modal_mass[:, None]
+    decay = plant.damping / mass
+    if plant.stretch is None:
+        return omega, decay / (2 * omega), None
+    pose = jnp.asarray(case.path.waypoints[-1])
+    chain = close_chain(plant, pose, jnp.zeros_like(pose))
+    far = plant.platform_mass + jnp.sum(plant.tip_mass)
+    lightness = chain.frame.rho_f**2 / plant.slider_link_mass + 1 / far
+    # modal mass over the mass that an elongation moves
+    share = plant.modal_mass / plant.stretch**2 * lightness
+    square = plant.stiffness[:, -1] / plant.modal_mass
+    own = jnp.sqrt(square * share)
+    omega = jnp.concatenate([omega, own[:, None]], axis=1)
+    held = decay[:, -1] * share
+    zeta = jnp.concatenate([decay[:, :-1], held[:, None]], axis=1) / (2 * omega)
+    return omega, zeta, (own**2 - square, held - decay[:, -1])
+
+
 def _exponential(
-    structure: Structure, case: Case, omega: Array, zeta: Array, step: Array
+    structure: Structure, case: Case, split: tuple[Array, ...], step: Array
 ) -> Exponential:
     electronics = case.electronics
     return exponential_step(
-        omega,
-        zeta,
+        split[0],
+        split[1],
         step,
         electronics.antialias,
         electronics.sensor_highpass if structure.has_sensor_highpass else None,
@@ -179,13 +241,17 @@ def _passage(structure: Structure, case: Case, step: Array) -> Array | None:
     )
 
 
-def _left_out(structure: Structure, case: Case, basis: ModalBasis, step: Array) -> LeftOut | None:
-    """Static response of the modes that the plant leaves out."""
-    if not structure.has_static_correction:
+def _left_out(
+    structure: Structure, case: Case, basis: ModalBasis, stretch: Stretch | None, step: Array
+) -> LeftOut | None:
+    """Static response of the modes that the plant leaves out, and of links of given length."""
+    if not structure.has_static_correction and stretch is None:
         return None
+    share = float(structure.has_static_correction)
+    sensor = share * _left_out_voltage(case, basis)
     return LeftOut(
-        sensor=_left_out_voltage(case, basis),
-        deflection=left_out_deflection(case, basis),
+        sensor=sensor if stretch is None else sensor + held_voltage(stretch),
+        deflection=share * left_out_deflection(case, basis),
         passage=_passage(structure, case, step),
     )
 
@@ -193,12 +259,12 @@ def _left_out(structure: Structure, case: Case, basis: ModalBasis, step: Array) 
 def _left_out_voltage(case: Case, basis: ModalBasis, mode_mask: Array = 1.0) -> Array:
     """Sensor volts per actuator volt by all but some modes of a basis [V/V], (3, K, K)."""
     lambda_s, lambda_a = (x[:, None, None] for x in _constants(case))
-    return lambda_s * lambda_a * static_remainder(basis, mode_mask).slope
+    return lambda_s * lambda_a * static_remainder(basis, mode_mask)[0]
 
 
 def left_out_deflection(case: Case, basis: ModalBasis) -> Array:
     """Deflection at the stations that the actuators give modes beyond `basis` [m/V], (3, S, K)."""
-    return _constants(case)[1][:, None, None] * static_remainder(basis).deflection
+    return _constants(case)[1][:, None, None] * static_remainder(basis)[1]
 
 
 def _rest(structure: Structure, case: Case, plant: Plant) -> Rest:
@@ -306,6 +372,9 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
         mask=mask,
         feedthrough=_left_out_voltage(case, model, jnp.pad(mask, (0, model.mass.shape[1] - n))),
     )
+    stretch = stretch_of(structure._replace(basis=structure.controller_basis), case)
+    if stretch is not None:  # below longitudinal modes links lengthen freely
+        nominal = nominal._replace(feedthrough=nominal.feedthrough + stretch.local)
     law = LAWS[structure.law]
     feedback = law.design(structure, case, nominal)
     sizes = structure.n_links, n_channels(structure), structure.n_patches
@@ -367,13 +436,24 @@ def design_taps(case: Case, bases: Bases) -> shaper.Taps:
     return reduce(shaper.in_series, map(one, jnp.asarray(shaping.omega), jnp.asarray(shaping.zeta)))
 
 
-def _initial_modes(structure: Structure, case: Case, bases: Bases) -> Array:
-    """Modal coordinates at t = 0: given ones plus a static load F at x, q_j = Y_j(x) F/k_j."""
+def _initial_coordinates(structure: Structure, case: Case, bases: Bases, plant: Plant) -> Array:
+    """Modal coordinates at t = 0: given ones plus a static load F at x, q_j = Y_j(x) F/k_j.
+
+    Elongations are those of the steady load.
+    """
     initial, at, stiffness = case.initial, bases.at_load, bases.plant.stiffness
     compliance = jnp.sum(at * at / stiffness, axis=1)
     load = jnp.asarray(initial.load_deflection) / jnp.where(compliance > 0, compliance, 1.0)
     modal = jnp.where(jnp.arange(structure.n_modes) < case.n_modes, initial.modal, 0.0)
-    return modal + at / stiffness * load[:, None]
+    modal = modal + at / stiffness * load[:, None]
+    if plant.stretch is None:
+        return modal
+    still, pose = jnp.zeros_like(plant.stiffness), jnp.asarray(case.path.waypoints[0])
+    if structure.has_wrench:
+        at_rest = 0 * pose
+        force = axial_force(plant, pose, at_rest, at_rest, case.load.wrench)
+        still = held_coordinates(plant, force)
+    return still.at[:, :-1].add(modal)
 
 
 def lowpass_corner(structure: Structure, case: Case, bases: Bases) -> Array:
@@ -388,14 +468,18 @@ def _static_status(
     case: Case,
     bases: Bases,
     design: ControllerDesign,
-    mode_step: Array,
-    zeta: Array,
+    split: tuple[Array, ...],
+    step: Array,
 ) -> Array:
-    """Status before the run; of the plant modes omega h and the damping ratio [1], (3, R)."""
+    """Status before the run; `step` of the plant [s]."""
     is_used = jnp.arange(structure.n_modes) < case.n_modes
-    mode_step, zeta = (jnp.where(is_used, x, 0.0) for x in (mode_step, zeta))
+    mode_step, zeta = (
+        jnp.where(is_used, x[:, : structure.n_modes], 0.0) for x in (split[0] * step, split[1])
+    )
+    stiff = drive_rate(structure.drive, case) * step
+    if structure.has_stretch:
+        stiff = jnp.maximum(stiff, STRETCHING * jnp.max(split[0][:, -1]) * step)
     patches, windows, control = case.machine.patches, case.windows, case.control
-    step = case.electronics.period / structure.substeps
     length = jnp.broadcast_to(case.machine.beam.length, (structure.n_links,))
     is_off, is_overlapping = placement_faults(patches, length)
     checks = (
@@ -408,7 +492,7 @@ def _static_status(
             status.TOO_FAST,
         ),
         (
-            drive_rate(structure.drive, case) * step > STIFFNESS_LIMIT,
+            stiff > STIFFNESS_LIMIT,
             status.TOO_STIFF,
         ),
         (jnp.any(zeta >= 1), status.OVERDAMPED),

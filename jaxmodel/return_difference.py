@@ -9,6 +9,7 @@ from 3x3 matrices. docs/theory.md, "Gain margins of a batch". Shapes: structure 
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.delay import true_delay
 from jaxmodel.estimator import Estimator
-from jaxmodel.frequency_response import PlantResponse, plant_response
+from jaxmodel.frequency_response import Assembled, PlantResponse, assembled, plant_response
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import Loop
 from jaxmodel.notch import Notch
@@ -27,6 +28,8 @@ from jaxmodel.trigonometry import sine_cosine
 
 #: Images n of the spectrum that are summed; those left out change the sum by 1e-4.
 IMAGES = (0, -1, 1, -2)
+#: Images of which only what is direct counts.
+FAR = (2, -3, 3, -4, 4, -5, 5)
 #: Modes are taken to be at least as wide as this share of their frequency [1].
 NARROWEST = 1e-6
 
@@ -35,7 +38,7 @@ class Lateness(NamedTuple):
     """Delay of the commands beyond one sample."""
 
     time: Array  # tau [s], ()
-    images: Pair  # exp(-j 2 pi n tau/T) of the `IMAGES`, (4,)
+    images: Pair  # exp(-j 2 pi n tau/T) of `IMAGES` and `FAR`
 
 
 class LoopResponse(NamedTuple):
@@ -50,8 +53,14 @@ class LoopResponse(NamedTuple):
     square: Array  # omega^2 of the modes of a link with held ends [1/s2], (3, R)
     decay: Array  # 2 zeta omega [1/s], (3, R)
     lightness: Array  # inertia left to a mode that drags only the pose's mass [1], (3, R)
-    enter: Array  # generalised force on the pose per modal acceleration, (3, 3, R)
-    leave: Array  # inertia force on a mode per pose acceleration, (3, 3, R)
+    # of elongations, the ports and the two motions by which they move modes: see `PlantResponse`
+    longer: tuple[Array, Array, Array] | None
+    heavy: Array | None  # mass that an elongation feels above all frequencies [kg], (3,)
+    port: Array  # (3, 2, P)
+    enter: Array  # (3, 2, R)
+    leave: Array  # (3, 2, R)
+    push: Array  # force on an elongation per channel force, (n, C); None without elongations
+    read: Array  # channels per elongation, (n, C); None likewise
     observe: Array  # channels per modal coordinate, (n, C, R)
     act: Array  # on the modes per channel force, (n, C, R)
     direct: Array  # by modes that are left out, channels per channel force, (n, C, C)
@@ -82,7 +91,10 @@ def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
     law, through = loop.controller.feedback, loop.controller.feedthrough
     assert isinstance(law, Channels)
     plant = plant_response(structure, case, loop, pose)
-    drag = jnp.einsum("ipr,pq,iqr->ir", plant.enter, jnp.linalg.inv(plant.mass), plant.leave)
+    whole = assembled(plant)
+    light = jnp.linalg.inv(whole.mass)
+    drag = jnp.einsum("ipr,pq,iqr->ir", whole.enter, light, whole.leave)
+    longer = plant.longer
     return LoopResponse(
         mass=plant.mass,
         damping=plant.damping,
@@ -90,8 +102,13 @@ def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
         square=plant.square,
         decay=plant.decay,
         lightness=1 - drag,
+        longer=longer,
+        heavy=None if longer is None else 1 / jnp.diagonal(light)[len(plant.mass) :],
+        port=plant.port,
         enter=plant.enter,
         leave=plant.leave,
+        push=None if longer is None else jnp.einsum("ik,ikc->ic", plant.push, law.synthesizer),
+        read=None if longer is None else jnp.einsum("ick,ik->ic", law.filter, plant.read),
         observe=jnp.einsum("ick,ikr->icr", law.filter, plant.sensor),
         act=jnp.einsum("irk,ikc->icr", plant.actuator, law.synthesizer),
         direct=jnp.einsum("ick,ikl,ild->icd", law.filter, plant.direct, law.synthesizer),
@@ -110,7 +127,7 @@ def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
 
 def _lateness(case: Case) -> Lateness:
     late = true_delay(case.electronics) - 1
-    angle = 2 * np.pi * np.array(IMAGES) * late
+    angle = 2 * np.pi * np.array(IMAGES + FAR) * late
     return Lateness(late * case.electronics.period, Pair(jnp.cos(angle), -jnp.sin(angle)))
 
 
@@ -142,8 +159,10 @@ def _size(x: Pair) -> Array:
 
 
 #: Fields of links, and those that only links with channels need.
-_LINK_FIELDS = ("square", "decay", "lightness", "enter", "leave")
+_LINK_FIELDS = ("square", "decay", "lightness", "longer", "heavy", "port", "enter", "leave")
 _CHANNEL_FIELDS = (
+    "push",
+    "read",
     "observe",
     "act",
     "direct",
@@ -169,12 +188,12 @@ def controlled_first(response: LoopResponse, link_mask: np.ndarray, count: int) 
         rows = order[:most].reshape(most, *(1,) * (x.ndim - 2), order.shape[1])
         return np.take_along_axis(x, rows, axis=0)
 
-    links = {name: moved(getattr(response, name), len(link_mask)) for name in _LINK_FIELDS}
-    channels = {
-        name: jax.tree.map(lambda x: moved(x, count), getattr(response, name))
-        for name in _CHANNEL_FIELDS
+    parts = {
+        name: jax.tree.map(partial(moved, most=most), getattr(response, name))
+        for names, most in ((_LINK_FIELDS, len(link_mask)), (_CHANNEL_FIELDS, count))
+        for name in names
     }
-    return response._replace(**links, **channels)
+    return response._replace(**parts)
 
 
 class AssembledModes(NamedTuple):
@@ -186,13 +205,13 @@ class AssembledModes(NamedTuple):
     growth: Array  # growth rate of an unstable rest, 0: stable [1/s], ()
 
 
-def pose_coupling(response: LoopResponse | PlantResponse, xp: Any = jnp) -> Array:
+def pose_coupling(whole: Assembled, xp: Any = jnp) -> Array:
     """Entries of the mass matrix between pose and links, G' of `assembled_modes`, (p, n R)."""
 
     def side_by_side(x: Array) -> Array:
         return xp.concatenate([x[i] for i in range(len(x))], axis=1)
 
-    enter, leave = side_by_side(response.enter), side_by_side(response.leave)
+    enter, leave = side_by_side(whole.enter), side_by_side(whole.leave)
     # entries of both have one sign; without coupling the pose does not feel the links at all
     return xp.sign(leave) * xp.sqrt(xp.maximum(enter * leave, 0.0))
 
@@ -203,19 +222,20 @@ def assembled_modes(response: LoopResponse | PlantResponse) -> AssembledModes:
     With modal masses 1 the mass matrix is (1 G'; G M) and its Cholesky factor (1 0; G C),
     C C' = M - G G', so that K reduces to (K_q, -K_q G'C'^-1; ., C^-1 (K_p + G K_q G') C'^-1).
     """
-    drag = pose_coupling(response)
-    factor = jnp.linalg.inv(jnp.linalg.cholesky(response.mass - drag @ drag.T))
+    whole = assembled(response)
+    drag = pose_coupling(whole)
+    factor = jnp.linalg.inv(jnp.linalg.cholesky(whole.mass - drag @ drag.T))
 
     def reduced(pose: Array, links: Array) -> Array:
         side = -(factor @ drag) * links
         pose = factor @ (pose + (drag * links) @ drag.T) @ factor.T
         return jnp.block([[pose, side], [side.T, jnp.diag(links)]])
 
-    stiffness = reduced(response.stiffness, jnp.ravel(response.square))
-    damping = reduced(response.damping, jnp.ravel(response.decay))
+    stiffness = reduced(whole.stiffness, jnp.ravel(response.square))
+    damping = reduced(whole.damping, jnp.ravel(response.decay))
     square, shape = jnp.linalg.eigh(stiffness)
     n_links, n_modes = response.square.shape
-    energy, pose = shape * shape, len(response.mass)
+    energy, pose = shape * shape, len(whole.mass)
     links = jnp.sum(jnp.reshape(energy[pose:], (n_links, n_modes, -1)), axis=0)
     return AssembledModes(
         jnp.sqrt(jnp.maximum(square, 0.0)),
@@ -232,6 +252,7 @@ class LoopGain(NamedTuple):
     joint: list[Pair]  # of entering adj(x - L_i) leaving, the same way, (n, 3, 3)
     pose: Pair  # dynamic stiffness of the pose including its links, (3, 3)
     pose_inverse: Pair  # 1/det of that, ()
+    assembled: Pair  # det of the stiffness of pose and elongations, 0 at poles of the machine, ()
 
 
 def evaluate_loop_gain(
@@ -248,22 +269,24 @@ def evaluate_loop_gain(
     """
     n, gains, shares = response.observe.shape[0], [], []
     late = None if response.late is None else delayed(s, response.late.time)
+    stiff = Pair(jnp.ones_like(s.re), jnp.zeros_like(s.re))
     # kernels write them once
-    link_gain, pose_share = jax.jit(_link_gain), jax.jit(_share_in_pose)
+    link_gain, pose_share = jax.jit(_link_gain), jax.jit(_pose_alone)
     for i in range(response.square.shape[0]):
         link = _one_link(response, i, i < n)
         if i < n:
             apart = None if spread is None else spread[i : i + 1]
-            *gain, share = link_gain(link, s, shift, late, apart)
+            *gain, share, soft = link_gain(link, s, shift, late, apart)
             gains.append(gain)
         else:
-            share = pose_share(link, s)
+            share, soft = pose_share(link, s)
         shares.append(share)
+        stiff = stiff if soft is None else stiff * soft[0].inverse()
     own, joint = jax.tree.map(lambda *x: jnp.concatenate(x), *gains)
     links = sum(shares[1:], start=shares[0])
-    s2 = s * s
-    pose = s2 * response.mass + s * response.damping + response.stiffness - links * (s2 * s2)
-    return LoopGain(own, joint, pose, determinant(pose).inverse())
+    pose = s * s * response.mass + s * response.damping + response.stiffness - links
+    whole = determinant(pose)
+    return LoopGain(own, joint, pose, whole.inverse(), whole * stiff)
 
 
 def _one_link(response: LoopResponse, i: int, has_channels: bool) -> LoopResponse:
@@ -276,37 +299,93 @@ def _one_link(response: LoopResponse, i: int, has_channels: bool) -> LoopRespons
 
 def _link_gain(
     response: LoopResponse, s: Pair, shift: Pair, late: Pair | None, spread: Array | None
-) -> tuple[list[Pair], list[Pair], Pair]:
-    """`own` and `joint` of a link's `LoopGain`, and its share in the pose's stiffness, (p, p)."""
+) -> tuple[list[Pair], list[Pair], Pair, Pair | None]:
+    """`own` and `joint` of a link's `LoopGain`, and the first two of `_share_in_pose`."""
     observe, act = response.observe, response.act
     sampling = 2 * np.pi / response.period
     held = -shift + 1.0
     seen = None
-    for k, image in enumerate(IMAGES):
+    for k, image in enumerate(IMAGES + FAR):
         at = Pair(s.re, s.im + image * sampling)
         at2 = at * at
         chain = _electronics(response, at, at2, held)
         if late is not None and response.late is not None:
             chain = chain * (late * response.late.images[k])
+        if image in FAR:
+            seen = seen + chain * response.direct
+            continue
         inertia = 1.0 if image == 0 else response.lightness
         inverse = (at2 * inertia + at * response.decay + response.square).inverse()
-        part = (_through(observe, act, inverse) + response.direct) * chain
-        seen = part if seen is None else seen + part
+        own = _through(observe, act, inverse) + response.direct
         if image == 0:
-            leaving = _through(observe, response.leave, inverse) * (at2 * chain)
-            entering = _through(response.enter, act, inverse) * at2
-            links = _through(response.enter, response.leave, inverse).sum(0)
+            links, soft, leaving, entering, through = _at_ports(response, s, inverse)
+            own, leaving = own if through is None else own + through, leaving * chain
+        elif response.heavy is not None and response.longer is not None:
+            _, decay, spring = (x[:, -1] for x in response.longer)
+            free = (at2 * response.heavy + at * decay + spring).inverse()[:, None, None]
+            own = own + free * (response.read[:, :, None] * response.push[:, None])
+        seen = own * chain if seen is None else seen + own * chain
     channel = _channel(response, shift)[:, :, None]
     loop, leaving = (seen - response.feedthrough) * channel, leaving * channel
     if spread is not None:
         loop = _plus_diagonal(loop, Pair(-spread, jnp.zeros_like(spread)))
-    return *_by_link(loop, leaving, entering), links
+    return *_by_link(loop, leaving, entering), links, soft
 
 
-def _share_in_pose(response: LoopResponse, s: Pair) -> Pair:
-    """What the modes of a link without channels take from the pose's stiffness, (p, p)."""
+def _at_ports(
+    response: LoopResponse, s: Pair, inverse: Pair
+) -> tuple[Pair, Pair | None, Pair, Pair, Pair | None]:
+    """The first two of `_share_in_pose`; channels by pose, (n, C, p), forces on the pose by
+    channels, (n, p, C), and channels by channels through an elongation, (n, C, C)."""
+    s2 = s * s
+    links, soft, share = _share_in_pose(response, s, inverse)
+    leaving = _carried(_through(response.observe, response.leave, inverse) * s2, response.port)
+    entering = _carried(
+        _turned(_through(response.enter, response.act, inverse) * s2), response.port
+    )
+    entering = _turned(entering)
+    if soft is None or share is None:
+        return links, None, leaving, entering, None
+    pushed, heard = entering[:, -1] - response.push, leaving[:, :, -1] - response.read
+    entering = entering[:, :-1] - share[:, :, None] * pushed[:, None]
+    leaving = leaving[:, :, :-1] - heard[:, :, None] * share[:, None]
+    return links, soft, leaving, entering, heard[:, :, None] * (pushed * soft[:, None])[:, None]
+
+
+def _pose_alone(response: LoopResponse, s: Pair) -> tuple[Pair, Pair | None]:
+    """What a link without channels takes from the pose's stiffness, see `_share_in_pose`."""
     inverse = (s * s + s * response.decay + response.square).inverse()
-    return _through(response.enter, response.leave, inverse).sum(0)
+    return _share_in_pose(response, s, inverse)[:2]
+
+
+def _share_in_pose(
+    response: LoopResponse, s: Pair, inverse: Pair
+) -> tuple[Pair, Pair | None, Pair | None]:
+    """What a link takes from the pose's stiffness, (p, p), its elongation eliminated.
+
+    Returns:
+        that; elongation per force on it, (n,); and per motion of the pose, sign reversed, (n, p).
+    """
+    s2, port = s * s, response.port
+    taken = _carried(_through(response.enter, response.leave, inverse) * (s2 * s2), port)
+    taken = _carried(_turned(taken), port)
+    if response.longer is None:
+        return taken.sum(0), None, None
+    mass, damping, stiffness = response.longer
+    row = s2 * mass + s * damping + stiffness - taken[:, -1]
+    pose, soft = row[:, :-1], row[:, -1].inverse()
+    share = pose * soft[:, None]
+    taken = taken[:, :-1, :-1] + share[:, :, None] * pose[:, None]
+    return taken.sum(0), soft, share
+
+
+def _carried(x: Pair, port: Array) -> Pair:
+    """x port, (n, A, 2) and (n, 2, P) to (n, A, P)."""
+    return (x[:, :, :, None] * port[:, None]).sum(2)
+
+
+def _turned(x: Pair) -> Pair:
+    return Pair(jnp.swapaxes(x.re, 1, 2), jnp.swapaxes(x.im, 1, 2))
 
 
 def _through(one: Array, other: Array, inverse: Pair) -> Pair:

@@ -557,12 +557,14 @@ def spillover(structure: Structure, case: Case, matrices: LoopMatrices) -> Array
     control = case.control
     on = jnp.asarray(control.link_mask)[:, None] * control.mode_mask
     on = on * (jnp.arange(n) < control.n_active)
-    is_left = jnp.ravel(1.0 - jnp.pad(on, ((0, 0), (0, modes - n))))
-    is_left = is_left * jnp.ravel(jnp.tile(jnp.arange(modes) < case.n_modes, structure.n_links))
+    is_left = 1.0 - jnp.pad(on, ((0, 0), (0, modes - n)))
+    is_left = is_left * (jnp.arange(modes) < case.n_modes)
+    is_left = jnp.ravel(jnp.pad(is_left, ((0, 0), (0, structure.n_coordinates - modes))))
     # omega of mode j grows as j^2; fixed weights, so that derivatives are of the loop alone
-    weight = is_left * jnp.tile(jnp.arange(1.0, modes + 1) ** 4, structure.n_links)
+    order = jnp.arange(1.0, structure.n_coordinates + 1)
+    weight = is_left * jnp.tile(order**4, structure.n_links)
     first = 2 * structure.n_pose
-    last = first + structure.n_links * modes
+    last = first + is_left.size
 
     def ringing(transition: Array) -> tuple[Array, Summed]:
         outputs = jnp.zeros(transition.shape[0], transition.dtype).at[first:last].set(weight)

@@ -16,7 +16,13 @@ import numpy as np
 
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array, Beam, Patches
-from jaxmodel.piezo import bare_stiffness, one_sided_section, patch_ends, two_sided_section
+from jaxmodel.piezo import (
+    bare_stiffness,
+    one_sided_section,
+    opposite_gain,
+    patch_ends,
+    two_sided_section,
+)
 
 if TYPE_CHECKING:
     from jaxmodel.beam import ModalBasis
@@ -61,6 +67,25 @@ def link_pieces(beam: Beam, patches: Patches, places: Array = ()) -> Pieces:
     )
 
 
+def _ceramic_faces(patches: Patches, pieces: Pieces) -> tuple[Array, Array]:
+    """1 where ceramic covers one face, and the other, else 0, (K, n) each."""
+    paired = pieces.has_actuator * patches.is_paired
+    return jnp.maximum(pieces.has_ceramic, paired), pieces.has_actuator
+
+
+def patch_count(patches: Patches, pieces: Pieces) -> Array:
+    """Layers of ceramic on each piece, (n,)."""
+    one, other = _ceramic_faces(patches, pieces)
+    return jnp.sum(one + other, axis=0)
+
+
+def driving(beam: Beam, patches: Patches, pieces: Pieces, has_patches: bool) -> Array:
+    """Moment of each actuator on each piece over `actuator_constant` [1], (K, n)."""
+    if not has_patches:
+        return pieces.has_actuator
+    return pieces.has_actuator * (1 + opposite_gain(beam, patches) * pieces.has_ceramic)
+
+
 def section_stiffness(beam: Beam, patches: Patches, pieces: Pieces, has_patches: bool) -> Array:
     """True bending stiffness E I of each piece [N m2], (n,).
 
@@ -73,7 +98,7 @@ def section_stiffness(beam: Beam, patches: Patches, pieces: Pieces, has_patches:
     if has_patches:
         single = one_sided_section(beam, patches).stiffness
         double = two_sided_section(beam, patches).stiffness
-        one, other = pieces.has_ceramic, pieces.has_actuator
+        one, other = _ceramic_faces(patches, pieces)
         stiffness = stiffness + single * jnp.sum(one + other, axis=0)
         stiffness = stiffness + (double - 2 * single) * jnp.sum(one * other, axis=0)
     return stiffness * beam.stiffness_factor
@@ -91,7 +116,7 @@ def section_mass(beam: Beam, patches: Patches, pieces: Pieces, has_patches: bool
     if not has_patches:
         return line_mass * jnp.ones_like(pieces.left)
     patch_mass = patches.density * patches.width * patches.thickness
-    return line_mass + patch_mass * jnp.sum(pieces.has_ceramic + pieces.has_actuator, axis=0)
+    return line_mass + patch_mass * patch_count(patches, pieces)
 
 
 def bent_at(pieces: Pieces, length: Array, x: Array) -> Array:
@@ -104,29 +129,27 @@ def bent_at(pieces: Pieces, length: Array, x: Array) -> Array:
     return (above - x / length * ((length - p) ** 2 - (length - q) ** 2)) / 2
 
 
-class StaticResponse(NamedTuple):
-    """Response to moments of the actuators, per moment; of all links with a leading axis (3,)."""
-
-    slope: Array  # differences over the sensors [rad/(N m)], (K, K)
-    deflection: Array  # from the chord at the stations [m/(N m)], (S, K)
-
-
 def static_bending(
     beam: Beam, patches: Patches, stations: Array, has_patches: bool
-) -> StaticResponse:
+) -> tuple[Array, Array]:
     """Static response of one link.
 
     Args:
         beam, patches: one link's data.
         stations: where to take the deflection [m], (S,).
         has_patches: patches stiffen the link (static).
+
+    Returns:
+        Per moment of the actuators, differences of slope over the sensors [rad/(N m)], (K, K), and
+        deflections from the chord at the stations [m/(N m)], (S, K).
     """
     pieces = link_pieces(beam, patches)
     softness = 1 / section_stiffness(beam, patches, pieces, has_patches)
     width = (pieces.right - pieces.left) * softness
-    slope = jnp.einsum("kn,ln,n->kl", pieces.has_sensor, pieces.has_actuator, width)
+    drive = driving(beam, patches, pieces, has_patches)
+    slope = jnp.einsum("kn,ln,n->kl", pieces.has_sensor, drive, width)
     bent = bent_at(pieces, beam.length, stations) * softness
-    return StaticResponse(slope, jnp.einsum("sn,ln->sl", bent, pieces.has_actuator))
+    return slope, jnp.einsum("sn,ln->sl", bent, drive)
 
 
 def static_loads(beam: Beam, patches: Patches, stations: Array, has_patches: bool) -> Array:
@@ -172,14 +195,13 @@ def static_loads(beam: Beam, patches: Patches, stations: Array, has_patches: boo
         ends = beam.joint_inertia_c * s / length - beam.joint_inertia_b * (1 - s / length)
         inertia = inertia.at[1].add(ends)
     moment = jnp.concatenate([pushed, inertia])
-    seen, driven = (
-        x[:, :, None] * jnp.ones_like(s) for x in (pieces.has_sensor, pieces.has_actuator)
-    )
+    drive = driving(beam, patches, pieces, has_patches)
+    seen, driven = (x[:, :, None] * jnp.ones_like(s) for x in (pieces.has_sensor, drive))
     rows = jnp.concatenate([seen, pushed, driven])
     return jnp.einsum("vng,lng,ng->vl", rows, moment, softness)
 
 
-def static_remainder(basis: ModalBasis, mode_mask: Array = 1.0) -> StaticResponse:
+def static_remainder(basis: ModalBasis, mode_mask: Array = 1.0) -> tuple[Array, Array]:
     """Exact static response of all links less that of the modes, sum_j Phi_s,jk Phi_a,jl/k_j.
 
     Args:
@@ -187,7 +209,7 @@ def static_remainder(basis: ModalBasis, mode_mask: Array = 1.0) -> StaticRespons
         mode_mask: modes that count, (3, R) or what broadcasts to it; default: all that exist.
     """
     driven = basis.actuator_slope * (mode_mask / basis.stiffness)[..., None]
-    return StaticResponse(
+    return (
         basis.static_slope - jnp.einsum("irk,irl->ikl", basis.sensor_slope, driven),
         basis.static_deflection - jnp.einsum("isr,irl->isl", basis.deflection_at, driven),
     )

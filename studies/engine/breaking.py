@@ -214,6 +214,7 @@ class _ChangedLoops:
             feedback=np.zeros_like(matrix),
             mode_poles=np.full((0, self._fixed[0].n_links), np.nan),
             omega=omega,
+            has_stretch=self._fixed[0].has_stretch,
             is_drive=np.arange(len(matrix)) < 2 * self._fixed[0].n_pose,
             period=float(self._case.electronics.period),
         )

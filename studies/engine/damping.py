@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxmodel.frequency_response import assembled
 from jaxmodel.pairs import Pair
 from jaxmodel.pole_paths import OrderPoles, refine_closed_loop_poles, refine_open_loop_poles
 from jaxmodel.return_difference import AssembledModes, LoopResponse, pose_coupling
@@ -84,25 +85,30 @@ def _open_loop_poles(response: LoopResponse, modes: AssembledModes, n_orders: in
         found.append(-loss + 1j * np.sqrt(omega**2 - loss**2))
         is_clear &= share.min(axis=0) > CLEAR
     poles = np.array(found)
+    n_rigid = response.mass.shape[0] + (0 if response.longer is None else n_links)
     for k in np.flatnonzero(~is_clear & np.isfinite(modes.omega).all(axis=0)):
-        poles[:, :, k] = link_poles(_state(response, k), n_links, len(poles))
+        poles[:, :, k] = link_poles(_state(response, k), n_links, len(poles), n_rigid)
     return poles
 
 
 def _state(response: LoopResponse, k: Any) -> np.ndarray:
-    """A of the plant of lane k in (X, X', q, q'), by the equations of `assembled_modes`."""
+    """A of the plant of lane k in (y, y', q, q'), by the equations of `assembled_modes`.
+
+    y are the pose and the links' elongations.
+    """
     response = jax.tree.map(lambda x: x[..., k], response)
-    drag = pose_coupling(response, np)
+    rigid = assembled(response, np)
+    drag = pose_coupling(rigid, np)
     pose, modes = drag.shape
     n, none = pose + modes, np.zeros_like(drag)
-    mass = np.block([[response.mass, drag], [drag.T, np.eye(modes)]])
+    mass = np.block([[rigid.mass, drag], [drag.T, np.eye(modes)]])
 
     def per_mass(own: np.ndarray, links: np.ndarray) -> np.ndarray:
         whole = np.block([[own, none], [none.T, np.diag(np.ravel(links))]])
         return np.asarray(np.linalg.solve(mass, whole))
 
-    stiffness = per_mass(response.stiffness, response.square)
-    damping = per_mass(response.damping, response.decay)
+    stiffness = per_mass(rigid.stiffness, response.square)
+    damping = per_mass(rigid.damping, response.decay)
     state = np.block([[np.zeros((n, n)), np.eye(n)], [-stiffness, -damping]])
     order = np.r_[:pose, n : n + pose, pose:n, n + pose : 2 * n]
     return state[np.ix_(order, order)]

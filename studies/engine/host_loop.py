@@ -19,14 +19,15 @@ class SampledLoop(NamedTuple):
     open: np.ndarray  # transition over a sample without gains, (n, n)
     feedback: np.ndarray  # what the gains add, (n, n)
     mode_poles: np.ndarray  # of the link modes without control [rad/s], NaN: overdamped, (J, 3)
-    omega: np.ndarray  # of the plant's modal coordinates [rad/s], (3, R)
+    omega: np.ndarray  # of the links' coordinates [rad/s], (3, R)
+    has_stretch: bool  # the last of them is an elongation
     period: float  # [s]
     is_drive: np.ndarray  # whether an entry of the state belongs to pose or drive, (n,)
 
     @property
     def n_modes(self) -> int:
-        """R of each link."""
-        return self.omega.shape[1]
+        """Of each link."""
+        return self.omega.shape[1] - self.has_stretch
 
     @property
     def is_open_loop_stable(self) -> bool:
@@ -39,7 +40,7 @@ class SampledLoop(NamedTuple):
 
 
 def sampled_loop(
-    matrices: LoopMatrices, omega: np.ndarray, period: float, n_tracked: int
+    matrices: LoopMatrices, omega: np.ndarray, period: float, n_tracked: int, has_stretch: bool
 ) -> SampledLoop:
     """A loop on the host from matrices of `jaxmodel.sampled_loop`, NumPy arrays."""
     is_drive = np.arange(len(matrices.open)) < 2 * len(omega)
@@ -50,12 +51,15 @@ def sampled_loop(
         feedback=matrices.feedback,
         mode_poles=link_poles(matrices.plant, len(omega), n_tracked),
         omega=omega,
+        has_stretch=has_stretch,
         period=period,
         is_drive=is_drive,
     )
 
 
-def link_poles(state: np.ndarray, n_links: int, n_tracked: int) -> np.ndarray:
+def link_poles(
+    state: np.ndarray, n_links: int, n_tracked: int, n_rigid: int | None = None
+) -> np.ndarray:
     """Poles [rad/s] of the uncontrolled link modes, by order, then ascending, (J, n_links).
 
     A pole belongs to the order of modes, or to the pose on its drives, that takes part in its
@@ -65,9 +69,11 @@ def link_poles(state: np.ndarray, n_links: int, n_tracked: int) -> np.ndarray:
 
     Args:
         state: A of the plant, `LoopMatrices.plant`.
-        n_links: as many as the pose has coordinates.
+        n_links: their number.
         n_tracked: J.
+        n_rigid: coordinates before the modes; None: as many as links, those of the pose.
     """
+    first = 2 * (n_links if n_rigid is None else n_rigid)
     from scipy.linalg import eig
     from scipy.optimize import linear_sum_assignment  # they take a quarter of a second
 
@@ -75,9 +81,9 @@ def link_poles(state: np.ndarray, n_links: int, n_tracked: int) -> np.ndarray:
     upper = value.imag > 0
     value, factor = value[upper], (left.conj() * right)[:, upper]
     factor = (factor / factor.sum(axis=0)).real
-    orders = factor[2 * n_links :].reshape(2, n_links, -1, value.size).sum(axis=(0, 1))
-    share = np.vstack([factor[: 2 * n_links].sum(axis=0), orders])
-    place = np.repeat(np.arange(len(share)), n_links)
+    orders = factor[first:].reshape(2, n_links, -1, value.size).sum(axis=(0, 1))
+    share = np.vstack([factor[:first].sum(axis=0), orders])
+    place = np.repeat(np.arange(len(share)), [first // 2, *[n_links] * len(orders)])
     which, at = linear_sum_assignment(share[place].T, maximize=True)
     order = np.full(value.size, -1)
     order[which] = place[at] - 1
@@ -89,7 +95,7 @@ def link_poles(state: np.ndarray, n_links: int, n_tracked: int) -> np.ndarray:
 
 
 def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
-    """What moves at a pole: "mode 7 of links 1+2 (5606 Hz)", or the drives.
+    """What moves at a pole: "mode 7 of links 1+2 (5606 Hz)", "stretch of link 3", or the drives.
 
     The link modes named hold most of the energy omega^2 |q|^2 + |q'|^2 of the eigenvector. Whether
     the motion belongs to a link, the drive or a filter is decided by participation factors,
@@ -119,6 +125,8 @@ def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
     modes, moving = _dominant(energy.sum(axis=0)), _dominant(energy.sum(axis=1))
     own = ", ".join(f"{loop.omega[moving, j].mean() / (2 * np.pi):.0f}" for j in modes)
     text = f"{_numbered('mode', modes)} of {_numbered('link', moving)} ({own} Hz)"
+    if loop.has_stretch and energy.sum(axis=0).argmax() == loop.n_modes:
+        text = f"stretch of {_numbered('link', moving)}"
     if links > filters:
         return text
     if hertz < 1:

@@ -111,20 +111,36 @@ class LoopGains(NamedTuple):
         plant, n = self.plant, len(w)
         (links, k), p = plant.sensor.shape[1:3], plant.mass.shape[-1]
         square = w * w
-        blocks = self._modal_sums(w)  # (n, l, N, K + p, K + p)
         at = (..., None, None)
         dynamic = (1j * w)[at] * plant.damping[:, None] + (
             plant.stiffness[:, None] - square[at] * plant.mass[:, None]
         )
-        dynamic = dynamic - (square * square)[at] * blocks[..., k:, k:].sum(axis=1)
+        own, leaving, entering, taken = self._at_ports(w)
+        dynamic = dynamic - taken[..., :p, :p].sum(axis=1)
+        own = own + plant.direct[:, :, None]
+        if plant.longer is not None:  # elongations are eliminated
+            jw, w2 = 1j * w[:, None, :, None], square[:, None, :, None]
+            mass, damping, stiffness = (x[:, :, None] for x in plant.longer)
+            row = jw * damping + (stiffness - w2 * mass) - taken[..., p, :]
+            share = row[..., :p] / row[..., p:]
+            heard = leaving[..., p] + plant.read[:, :, None] / w2
+            pushed = entering[..., p] + plant.push[:, :, None] / w2
+            dynamic = dynamic - np.swapaxes(share, 1, 2).swapaxes(2, 3) @ np.swapaxes(
+                row[..., :p], 1, 2
+            )
+            own = own + (heard * w2 * w2 / row[..., p:])[..., None] * pushed[..., None, :]
+            leaving, entering = (
+                x[..., :p] - y[..., None] * share[..., None, :]
+                for x, y in ((leaving, heard), (entering, pushed))
+            )
         compliance = (gain * square * square)[at] * small_inverse(dynamic)
-        leaving = blocks[..., :k, k:].transpose(0, 2, 1, 3, 4).reshape(n, -1, links * k, p)
-        entering = blocks[..., k:, :k].transpose(0, 2, 3, 1, 4).reshape(n, -1, p, links * k)
+        leaving = leaving.transpose(0, 2, 1, 3, 4).reshape(n, -1, links * k, p)
+        entering = entering.transpose(0, 2, 4, 1, 3).reshape(n, -1, p, links * k)
         leaving = (leaving @ compliance).reshape(n, -1, images, links * k, p)
         # the sum over images and pose is one product
         left = leaving.transpose(0, 1, 3, 2, 4).reshape(n, -1, links * k, p * images)
         sensed = left @ entering[..., self.acting].reshape(n, -1, p * images, len(self.acting))
-        own = gain[:, None, :, None, None] * (blocks[..., :k, :k] + plant.direct[:, :, None])
+        own = gain[:, None, :, None, None] * own
         own = own.reshape(n, links, -1, images, k, k).sum(axis=3)
         whole = np.zeros((*sensed.shape[:3], links * k), complex)
         for i in range(links):
@@ -132,11 +148,27 @@ class LoopGains(NamedTuple):
             whole[..., rows, rows] = own[:, i]
         return sensed + whole[..., self.acting]
 
-    def _modal_sums(self, w: np.ndarray) -> np.ndarray:
-        """Sums over the modes of each link at j w, (n, l, N, K + p, K + p).
+    def _at_ports(self, w: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Of each link, sensors by actuators, (n, l, N, K, K), over w^2 sensors and actuators by
+        ports, (n, l, N, K, P), and what modes take from the ports' stiffness, (n, l, N, P, P)."""
+        blocks, port = self._modal_sums(w), self.plant.port
+        (n, links), k = blocks.shape[:2], blocks.shape[-1] - 2
 
-        Rows are sensors and forces on the pose, columns actuators and motions of the pose. Real and
-        imaginary parts are multiplied by real matrices, which takes half the time.
+        def carried(x: np.ndarray) -> np.ndarray:
+            flat = x.reshape(n, links, -1, 2) @ port
+            return flat.reshape(*x.shape[:-1], -1)
+
+        leaving, entering = blocks[..., :k, k:], np.swapaxes(blocks[..., k:, :k], 3, 4)
+        taken = carried(np.swapaxes(carried(blocks[..., k:, k:]), 3, 4))
+        taken = (w**4)[:, None, :, None, None] * taken
+        return blocks[..., :k, :k], carried(leaving), carried(entering), taken
+
+    def _modal_sums(self, w: np.ndarray) -> np.ndarray:
+        """Sums over the modes of each link at j w, (n, l, N, K + 2, K + 2).
+
+        Rows are sensors and forces on the two motions of its ports, columns actuators and these
+        motions. Real and imaginary parts are multiplied by real matrices, which takes half the
+        time.
         """
         plant, count = self.plant, w.shape[1]
         w = w[:, None, :, None]
@@ -145,14 +177,14 @@ class LoopGains(NamedTuple):
         size = 1 / (stiff * stiff + loss * loss)
         both = np.concatenate([stiff * size, -loss * size], axis=2) @ self.pairs
         whole = both[:, :, :count] + 1j * both[:, :, count:]
-        side = plant.sensor.shape[2] + plant.mass.shape[-1]
+        side = plant.sensor.shape[2] + 2
         return whole.reshape(*whole.shape[:3], side, side)
 
 
 def loop_gains(response: SampledLoopResponse) -> LoopGains:
     """Loop gains by frequency responses, leaves (n, ...), NumPy in float64."""
     plant = response.plant
-    rows = np.concatenate([plant.sensor, plant.enter], axis=2)  # (n, l, K + p, R)
+    rows = np.concatenate([plant.sensor, plant.enter], axis=2)  # (n, l, K + 2, R)
     columns = np.concatenate([np.swapaxes(plant.actuator, 2, 3), plant.leave], axis=2)
     pairs = np.einsum("niar,nibr->nirab", rows, columns)
     acting = np.flatnonzero(acting_commands(response.controller).any(axis=0))

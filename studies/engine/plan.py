@@ -28,6 +28,7 @@ STATIC = (
     "run.model",
     "link.basis",
     "link.shortening",
+    "link.stretch",
     "link.axial_inertia",
     "link.static_correction",
     "control.basis",

@@ -129,6 +129,7 @@ def _without_run(structure: Structure) -> Structure:
         "basis",
         "has_shortening",
         "is_distributed",
+        "has_stretch",
         "has_static_correction",
         "is_coupled",
         "has_wrench",

@@ -21,6 +21,7 @@ from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.imsc import IMSC
 from jaxmodel.linear import Moment, resting
+from jaxmodel.loop import coordinate_omega
 from jaxmodel.motion import PathSample, end_of_path, sample_path
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
@@ -111,7 +112,7 @@ class _Loops(NamedTuple):
     """Matrices of a case's loops; axes: instants of its motion (k), parts of its law (p)."""
 
     at_rest: LoopMatrices  # (p, ...)
-    omega: Array  # of the plant's modal coordinates [rad/s], (3, R)
+    omega: Array  # of the links' coordinates [rad/s], (3, R)
     time: Array | None  # [s], (k,)
     axial_force: Array | None  # tension in the links [N], (k, 3)
     in_motion: LoopMatrices | None  # (k, p, ...)
@@ -141,7 +142,7 @@ def _loops(
 
     if not has_motion:
         at_rest = matrices(pose, resting(structure, case))
-        return _Loops(at_rest, loop.omega, time=None, axial_force=None, in_motion=None)
+        return _Loops(at_rest, coordinate_omega(loop), time=None, axial_force=None, in_motion=None)
     time = jnp.linspace(0.0, 1.0, INSTANTS) * end_of_path(case.path)
     sample = sample_path(case.path, time)
     each = jax.vmap(axial_force, (None, 0, 0, 0, None))
@@ -158,7 +159,7 @@ def _loops(
     every = jax.lax.map(at, points)
     return _Loops(
         at_rest=jax.tree.map(lambda x: x[0], every),
-        omega=loop.omega,
+        omega=coordinate_omega(loop),
         time=time[instants],
         axial_force=force[instants],
         in_motion=jax.tree.map(lambda x: x[1:], every),
@@ -245,7 +246,7 @@ def _figures(
 
     def loop(matrices: LoopMatrices, *place: int) -> SampledLoop:
         matrices = jax.tree.map(lambda x: x[place], matrices)
-        return sampled_loop(matrices, loops.omega, period, n_tracked)
+        return sampled_loop(matrices, loops.omega, period, n_tracked, plain.has_stretch)
 
     with serial_blas():
         parts = [judge_loop(loop(loops.at_rest, p)) for p in range(len(modes))]

@@ -23,13 +23,13 @@ from studies.space.free import (
 from studies.study.consistency import patch_centers
 from studies.study.explain import explain
 from studies.study.files import find_spec, read_toml
+from studies.study.links import OneALink
 from studies.study.paths import as_tuples, field_unit, parse_entry
 from studies.study.signals import INPUTS, OUTPUTS, Signal, parse_signal
 from studies.study.sizes import lengths
 from studies.study.spec import (
     DESIGN,
     MACHINE,
-    OneALink,
     Pose,
     Section,
     Study,

@@ -18,6 +18,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, channel_parts
 from jaxmodel.laws.srf import SRF
 from jaxmodel.linear import resting
+from jaxmodel.loop import coordinate_omega
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import placement_faults
 from jaxmodel.prepare import prepare
@@ -121,7 +122,8 @@ class LoopBuilder:
     def loop(self, plant: PlantVariant, law: Controller) -> SampledLoop:
         """The loop of a plant and a controller with a channel for each patch (`pad_channels`)."""
         matrices, omega, _ = self._evaluate(plant, law)
-        kept, of_plant = _kept_states(matrices, self._design.structure, plant.n_modes)
+        structure = plant_structure(self._design, plant.basis, LARGEST)
+        kept, of_plant = _kept_states(matrices, structure, plant.n_modes)
         matrices = matrices._replace(
             open=matrices.open[np.ix_(kept, kept)],
             feedback=matrices.feedback[np.ix_(kept, kept)],
@@ -129,7 +131,8 @@ class LoopBuilder:
             reference=None if matrices.reference is None else matrices.reference[kept],
         )
         period = float(self._design.case.electronics.period)
-        return sampled_loop(matrices, omega[:, : plant.n_modes], period, plant.n_modes)
+        omega = omega[:, _is_kept(structure, plant.n_modes)]
+        return sampled_loop(matrices, omega, period, plant.n_modes, structure.has_stretch)
 
     def spillover_gains(self, plant: PlantVariant, law: Controller) -> SpilloverGains:
         """Coupling of the channels of a padded controller with a plant's modes, both ways."""
@@ -185,6 +188,7 @@ def plant_structure(design: FixedController, basis: str, n_modes: int) -> Struct
         basis=basis,
         has_shortening=nominal.has_shortening,
         is_distributed=nominal.is_distributed,
+        has_stretch=nominal.has_stretch and BASES[basis].is_on_chord,
         has_static_correction=nominal.has_static_correction,
         law=SRF.name,
         drive=nominal.drive,
@@ -211,7 +215,13 @@ def _evaluate_loop(
     )
     at_rest = resting(structure, case)
     matrices = loop_matrices(structure, case, loop, law, pose, at_rest)
-    return matrices, loop.omega, gains
+    return matrices, coordinate_omega(loop), gains
+
+
+def _is_kept(structure: Structure, n_modes: int) -> np.ndarray:
+    """Which of a link's coordinates exist with fewer modes."""
+    order = np.arange(structure.n_coordinates)
+    return (order < n_modes) | (order >= structure.n_modes)
 
 
 def _kept_states(
@@ -222,8 +232,8 @@ def _kept_states(
 
     def entries(size: int) -> np.ndarray:
         is_kept = np.ones(size, bool)
-        modes = is_kept[first : first + rows * LARGEST].reshape(rows, LARGEST)
-        modes[:, n_modes:] = False
+        of_link = _is_kept(structure, n_modes)
+        is_kept[first : first + rows * len(of_link)] = np.tile(of_link, rows)
         return np.flatnonzero(is_kept)
 
     return entries(len(matrices.open)), entries(len(matrices.plant))

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel import motion
+from jaxmodel.beam import BASES
 from jaxmodel.case import (
     Case,
     Control,
@@ -78,6 +79,7 @@ def build_structure(study: Study, columns: Columns | None = None) -> Structure:
         basis=study.link.basis,
         has_shortening=study.link.shortening,
         is_distributed=study.link.axial_inertia == "distributed",
+        has_stretch=has_stretch(study),
         has_static_correction=study.link.static_correction,
         is_coupled=study.run.model == "coupled",
         controller_basis=study.control.basis,
@@ -90,6 +92,12 @@ def build_structure(study: Study, columns: Columns | None = None) -> Structure:
     )
     names = {name for group in SWITCHES.values() for name in group}
     return with_used(structure, [name for name in names if _is_used(name, fields.numbers(name))])
+
+
+def has_stretch(study: Study) -> bool:
+    """Whether links lengthen: not in bases whose ends leave the chord, nor without coupling."""
+    is_possible = BASES[study.link.basis].is_on_chord and study.run.model == "coupled"
+    return study.link.stretch and is_possible
 
 
 def _is_used(field: str, values: np.ndarray) -> bool:
@@ -231,6 +239,8 @@ def _machine(numbers: Numbers, structure: Structure, xp: Any) -> Machine:
             bridge=_bridge(numbers),
             gauge_noise=number("patches.gauge_noise"),
             hysteresis=number("patches.hysteresis"),
+            is_force=1.0 * number("link.stretch"),
+            is_paired=1.0 * number("patches.actuators"),
         ),
         damping=_damping(numbers, xp),
     )
@@ -254,7 +264,8 @@ def _damping(numbers: Numbers, xp: Any) -> Damping:
     count = xp.maximum(xp.sum(~xp.isnan(ratio), axis=-1), 1)
     last = xp.minimum(xp.arange(ratio.shape[-1]), count[..., None] - 1)
     exponent = xp.asarray([0.0, -1.0, 1.0])[numbers["link.damping_law"]]
-    return Damping(xp.take_along_axis(ratio, last, axis=-1), count, exponent)
+    ratio = xp.take_along_axis(ratio, last, axis=-1)
+    return Damping(ratio, count, exponent, numbers["link.stretch_damping"])
 
 
 def _path(numbers: Numbers, xp: Any) -> motion.Path:

@@ -6,6 +6,9 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+#: What can be free: tunings move what a designer decides, fits also what is found by measuring.
+DESIGN, MACHINE = "design", "machine"
+
 
 def described(default: Any, unit: str, text: str, free: str = "", **bounds: Any) -> Any:
     extra = {"unit": unit, "free": free}

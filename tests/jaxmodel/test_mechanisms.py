@@ -10,7 +10,7 @@ import pytest
 from jaxmodel import kinematics, status
 from jaxmodel.axial import stretch_error
 from jaxmodel.case import uncontrolled
-from jaxmodel.frequency_response import plant_response
+from jaxmodel.frequency_response import assembled, plant_response
 from jaxmodel.linear import linearise
 from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.mechanisms.check import check_mechanism
@@ -224,7 +224,8 @@ def test_closed_forms_of_the_linear_plant_are_those_of_its_matrices(name):
     structure, case = case_of(name)
     plant, linear = linear_forms(structure, case, np.array(POSES[name]))
     n, size = structure.n_pose, structure.n_links * structure.n_modes
-    enter, leave = (np.swapaxes(x, 0, 1).reshape(n, size) for x in (plant.enter, plant.leave))
+    whole = assembled(plant)
+    enter, leave = (np.swapaxes(x, 0, 1).reshape(n, size) for x in (whole.enter, whole.leave))
     mass = np.block([[plant.mass, enter], [leave.T, np.eye(size)]])
     zero = np.zeros((n, size))
 

@@ -219,6 +219,7 @@ def test_one_channel_at_its_limit_is_enough(factor, sign):
     loop = SimpleNamespace(
         controller=SimpleNamespace(voltage_limit=80.0),
         drive=SimpleNamespace(force_limit=np.array([10.0, 20.0, 30.0])),
+        plant=SimpleNamespace(stretch=None),
         axial_compliance=np.ones(3),
         observer=np.zeros((3, 1, 2)),
     )

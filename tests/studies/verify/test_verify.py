@@ -96,8 +96,8 @@ FAULTS = {
     ),
     "static correction with the wrong sign": Fault(
         "jaxmodel/prepare.py",
-        "return lambda_s * lambda_a * static_remainder(basis, mode_mask).slope",
-        "return -lambda_s * lambda_a * static_remainder(basis, mode_mask).slope",
+        "return lambda_s * lambda_a * static_remainder(basis, mode_mask)[0]",
+        "return -lambda_s * lambda_a * static_remainder(basis, mode_mask)[0]",
         "links and patches",
     ),
     "amplitude of a shaper": Fault(
