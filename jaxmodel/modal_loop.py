@@ -13,11 +13,11 @@ import numpy as np
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, linear_law
 from jaxmodel.discs import Disc
+from jaxmodel.frequency_response import assembled, plant_response
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import patch_ends
 from jaxmodel.prepare import prepare
-from jaxmodel.return_difference import loop_response
 
 
 class ModalLoop(NamedTuple):
@@ -64,29 +64,30 @@ def modal_loop(structure: Structure, case: Case, pose: Array, law: Controller) -
         ModalLoop.
     """
     loop = prepare(structure, case).loop
-    response = loop_response(structure, case, loop, pose)
+    response = plant_response(structure, case, loop, pose)
+    rigid = assembled(response)
     masses = case.machine.masses
     heavier = masses._replace(payload_mass=masses.payload_mass + 1.0)
     other = case._replace(machine=case.machine._replace(masses=heavier))
-    more = loop_response(structure, other, prepare(structure, other).loop, pose).mass
+    more = assembled(plant_response(structure, other, prepare(structure, other).loop, pose)).mass
     square = loop.omega**2
     exact = None
     if loop.left_out is not None:
         by_modes = jnp.einsum("ikr,irl->ikl", loop.sensor / square[:, None], loop.actuator)
         exact = loop.left_out.sensor + by_modes
-    added = more - response.mass
+    added = more - rigid.mass
     return ModalLoop(
-        mass=response.mass - masses.payload_mass * added,
+        mass=rigid.mass - masses.payload_mass * added,
         payload_mass=added,
         payload=jnp.asarray(masses.payload_mass),
-        damping=response.damping,
-        stiffness=response.stiffness,
+        damping=rigid.damping,
+        stiffness=rigid.stiffness,
         omega=loop.omega,
         spring=response.square / square - 1,
         zeta=response.decay / (2 * loop.omega),
         exponent=jnp.asarray(case.machine.damping.exponent),
-        enter=response.enter,
-        leave=response.leave,
+        enter=rigid.enter,
+        leave=rigid.leave,
         sensor=loop.sensor,
         actuator=loop.actuator,
         steepest=_steepest_slopes(case, loop.sensor, loop.actuator),
