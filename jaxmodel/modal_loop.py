@@ -1,4 +1,4 @@
-"""The sampled loop as modes, pose and controller, with its uncertain numbers kept apart.
+"""The sampled loop as modes, rigid part and controller, with its uncertain numbers kept apart.
 
 The stiffness of all links, an extra delay of the commands, the payload and a factor on all gains
 may vary over ranges; the controller's coefficients do not. `jaxmodel.zero_exclusion` reads it.
@@ -17,32 +17,39 @@ from jaxmodel.frequency_response import assembled, plant_response
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import patch_ends
-from jaxmodel.prepare import prepare
+from jaxmodel.prepare import prepare, stretch_of
+from jaxmodel.stretch import held_voltage
 
 
 class ModalLoop(NamedTuple):
     """One machine about rest with sine modes, and its controller; R modes a link, K patches.
 
     Modal masses are 1. Of the law, x[k+1] = A x[k] + B (y, v)[k] and m[k] = C x[k] + D (y, v)[k]
-    with sensor voltages y, voltages on the actuators v[k+1] = m[k], 3 K each.
+    with sensor voltages y, voltages on the actuators v[k+1] = m[k], U = 3 K each. The rigid part
+    has p coordinates: the pose, and the elongations of links that lengthen.
     """
 
-    mass: Array  # of the pose without payload, (3, 3)
-    payload_mass: Array  # what each kilogram of payload adds to it [1/kg], (3, 3)
+    mass: Array  # of the rigid part without payload, (p, p)
+    payload_mass: Array  # what each kilogram of payload adds to it [1/kg], (p, p)
     payload: Array  # of the study [kg], ()
-    damping: Array  # of the drive in the pose, (3, 3)
-    stiffness: Array  # (3, 3)
+    damping: Array  # of the drive, (p, p)
+    stiffness: Array  # (p, p)
+    axial_damping: Array  # of the links along themselves, in proportion to their stiffness, (p, p)
+    axial_stiffness: Array  # (p, p)
     omega: Array  # of the modes without axial force [rad/s], (3, R)
     spring: Array  # by axial forces, over omega^2 [1], (3, R)
     zeta: Array  # damping ratios [1], (3, R)
     exponent: Array  # p of zeta ~ omega^p beyond the R modes [1], ()
-    enter: Array  # force on the pose per modal acceleration, (3, 3, R)
-    leave: Array  # inertia force on a mode per pose acceleration, (3, 3, R)
+    enter: Array  # force on the rigid part per modal acceleration, (3, p, R)
+    leave: Array  # inertia force on a mode per acceleration of the rigid part, (3, p, R)
+    push: Array  # force on the rigid part per actuator voltage, (p, U)
+    read: Array  # sensor voltages per rigid coordinate, (U, p)
     sensor: Array  # sensor voltages per modal coordinate, (3, K, R)
     actuator: Array  # on the modes per actuator voltage, (3, R, K)
     # what |sensor| and |actuator| over the mode's number never exceed, (3, K) each
     steepest: tuple[Array, Array]
-    exact: Array | None  # static voltage per voltage of all modes [V/V], (3, K, K); None: none left
+    held: Array  # sensor voltage per voltage of links that keep their length [V/V], (3, K, K)
+    exact: Array | None  # it and the static one of all modes [V/V], (3, K, K); None: no correction
     law: tuple[Array, Array, Array, Array]  # A, B, C, D
     period: Array  # T [s], ()
     antialias: Array  # [rad/s], ()
@@ -72,25 +79,39 @@ def modal_loop(structure: Structure, case: Case, pose: Array, law: Controller) -
     more = assembled(plant_response(structure, other, prepare(structure, other).loop, pose)).mass
     square = loop.omega**2
     exact = None
-    if loop.left_out is not None:
-        by_modes = jnp.einsum("ikr,irl->ikl", loop.sensor / square[:, None], loop.actuator)
-        exact = loop.left_out.sensor + by_modes
+    if structure.has_static_correction:
+        by_modes = jnp.einsum("ikr,irl->ikl", response.sensor / square[:, None], response.actuator)
+        exact = response.direct + by_modes
     added = more - rigid.mass
+    links, patches, _ = response.sensor.shape
+    size, stretch = len(added), stretch_of(structure, case)
+    push = read = jnp.zeros((links, patches))
+    along, held = jnp.zeros((2, links)), jnp.zeros_like(response.direct)
+    if stretch is not None:
+        push, read = response.push, response.read
+        along, held = jnp.stack([stretch.damping, stretch.stiffness]), held_voltage(stretch)
+    own = np.eye(links, size, size - links)  # elongations come last
+    axial = jnp.einsum("ip,ai,iq->apq", own, along, own)
     return ModalLoop(
         mass=rigid.mass - masses.payload_mass * added,
         payload_mass=added,
         payload=jnp.asarray(masses.payload_mass),
-        damping=rigid.damping,
-        stiffness=rigid.stiffness,
+        damping=rigid.damping - axial[0],
+        stiffness=rigid.stiffness - axial[1],
+        axial_damping=axial[0],
+        axial_stiffness=axial[1],
         omega=loop.omega,
         spring=response.square / square - 1,
         zeta=response.decay / (2 * loop.omega),
         exponent=jnp.asarray(case.machine.damping.exponent),
         enter=rigid.enter,
         leave=rigid.leave,
-        sensor=loop.sensor,
-        actuator=loop.actuator,
-        steepest=_steepest_slopes(case, loop.sensor, loop.actuator),
+        push=jnp.einsum("ip,ik->pik", own, push).reshape(size, -1),
+        read=jnp.einsum("ip,ik->ikp", own, read).reshape(-1, size),
+        sensor=response.sensor,
+        actuator=response.actuator,
+        steepest=_steepest_slopes(case, response.sensor, response.actuator),
+        held=held,
         exact=exact,
         law=linear_law(law),
         period=jnp.asarray(case.electronics.period),

@@ -31,24 +31,27 @@ OVERLAP = 0.05
 class Tail(NamedTuple):
     """Sizes that the responses left out do not exceed; U = 3 K voltages in, sensors out.
 
-    Coupling with the pose is per nu^2, nu = omega/sqrt(E), and for pose coordinates times E.
+    Coupling with the rigid part of p coordinates, here "the pose" in short, is per nu^2,
+    nu = omega/sqrt(E), and for coordinates times E.
     """
 
     # from command to sampled voltage, times E, chain included, by slices of omega, (slices, U, U)
     images: Array
     sensor: Array  # the rest at image 0, chain excluded: from voltage, (U, U)
-    sensor_by_pose: Array  # from pose, (U, 3)
-    pose_by_voltage: Array  # force on the pose from voltage, (3, U)
-    pose_by_pose: Array  # from pose, per nu^4, (3, 3)
+    sensor_by_pose: Array  # from pose, (U, p)
+    pose_by_voltage: Array  # force on the pose from voltage, (p, U)
+    pose_by_pose: Array  # from pose, per nu^4, (p, p)
 
 
 class _Sizes(NamedTuple):
-    """Moduli of the modes' couplings, links and modes first; pose in coordinates of unit mass."""
+    """Moduli of couplings, links and modes first; pose in coordinates of unit mass, largest E."""
 
     sense: Array  # sensors per modal coordinate, (3, R, K)
     pull: Array  # static answer to voltages, |actuator|/omega^2, (3, R, K)
     enter: Array  # (3, R)
     leave: Array  # (3, R)
+    push: Array  # force on the pose by voltages at once, times E, (U,)
+    read: Array  # sensors by the pose at once, (U,)
     spring: float  # pose stiffness over mass [1/s2]
 
 
@@ -87,7 +90,8 @@ def bound_tail(
     """
     if not 0 <= loop.exponent <= 1 or np.any(loop.zeta <= 0) or np.any(loop.spring <= -0.5):
         return None
-    sizes, unknown = _sizes(loop, payload), _unknown(loop, payload)
+    sizes = _sizes(loop, payload, stiffness[1])
+    unknown = _unknown(loop, sizes)
     sampling = 2 * np.pi / float(loop.period)
     high = (np.arange(loop.omega.shape[1]) >= base) * 1.0
     edges = np.linspace(0, 0.5, SLICES + 1) * sampling
@@ -108,7 +112,7 @@ def bound_tail(
         return None
     total += far + _unknown_images(loop, unknown, stiffness)
     first = _suprema(loop, 0.0, (0.5 + OVERLAP) * sampling, stiffness)
-    return _with_first_image(loop, unknown, first, high, total, payload, stiffness)
+    return _with_first_image(loop, sizes, unknown, first, high, total, payload, stiffness)
 
 
 def _one_image(
@@ -173,11 +177,11 @@ def _chain(loop: ModalLoop, omega: float) -> float:
 
 
 def pose_scale(loop: ModalLoop, payload: float) -> Array:
-    """C^-1 of the pose's mass C C' with a payload, (3, 3)."""
+    """C^-1 of the rigid part's mass C C' with a payload, (p, p)."""
     return np.linalg.inv(np.linalg.cholesky(loop.mass + payload * loop.payload_mass))
 
 
-def _sizes(loop: ModalLoop, payload: float) -> _Sizes:
+def _sizes(loop: ModalLoop, payload: float, stiffest: float) -> _Sizes:
     scale = pose_scale(loop, payload)
     enter, leave = (np.linalg.norm(scale @ x, axis=1) for x in (loop.enter, loop.leave))
     return _Sizes(
@@ -185,16 +189,20 @@ def _sizes(loop: ModalLoop, payload: float) -> _Sizes:
         pull=np.abs(loop.actuator) / loop.omega[:, :, None] ** 2,
         enter=enter,
         leave=leave,
-        spring=float(np.linalg.norm(scale @ loop.stiffness @ scale.T, 2)),
+        push=stiffest * np.linalg.norm(scale @ loop.push, axis=0),
+        read=np.linalg.norm(loop.read @ scale.T, axis=1),
+        spring=sum(
+            float(np.linalg.norm(scale @ x @ scale.T, 2))
+            for x in (loop.stiffness, stiffest * loop.axial_stiffness)
+        ),
     )
 
 
-def _unknown(loop: ModalLoop, payload: float) -> _Unknown:
+def _unknown(loop: ModalLoop, sizes: _Sizes) -> _Unknown:
     """Coupling with the pose times j alternates between two values: known modes show its size.
 
     Where slopes are 0 there are no more modes.
     """
-    sizes = _sizes(loop, payload)
     count = loop.omega.shape[1]
     order = np.arange(1, count + 1)
     first = loop.omega[:, :1]
@@ -214,18 +222,14 @@ def _unknown(loop: ModalLoop, payload: float) -> _Unknown:
 
 
 def _static_rest(loop: ModalLoop, base: int) -> Array:
-    """Sizes of the static correction of `base` modes, (U, U)."""
-    links, patches, _ = loop.sensor.shape
-    if loop.exact is None:
-        return np.zeros((links * patches,) * 2)
+    """Sizes of `static_rest`, (U, U)."""
     return _on_diagonal(np.abs(static_rest(loop, base)))
 
 
 def static_rest(loop: ModalLoop, base: int) -> Array:
-    """Static voltages per voltage beyond `base` modes, (3, K, K); 0 without correction."""
+    """Static voltages per voltage beside `base` modes, (3, K, K)."""
     if loop.exact is None:
-        links, patches, _ = loop.sensor.shape
-        return np.zeros((links, patches, patches))
+        return np.asarray(loop.held)
     compliance = 1 / loop.omega[:, :base] ** 2
     by_modes = np.einsum(
         "ikr,ir,irl->ikl", loop.sensor[:, :, :base], compliance, loop.actuator[:, :base]
@@ -257,7 +261,8 @@ def _through_pose(
 ) -> Array | None:
     """From voltage to pose to sensor in a band, (U, U); None: no bound.
 
-    M p + sum enter q = 0, q = (pull u + x^2 leave p)/D: ||p|| <= f u/(1 - g), y <= h ||p||.
+    M p + sum enter q = -push u/nu^2, q = (pull u + x^2 leave p)/D: ||p|| <= f u/(1 - g),
+    y <= h ||p||; springs take part of M, dampers only add to it.
 
     Args:
         high: 1 for modes that the model leaves out, if it has the rest: only what these change;
@@ -280,7 +285,7 @@ def _through_pose(
     if slack <= 0:
         return None
     pushed, seen = (x.reshape(len(x), -1) for x in (pushed, seen))
-    whole = [np.sum(x, axis=0) for x in (seen, pushed)]
+    whole = [sizes.read + np.sum(seen, axis=0), sizes.push / low**2 + np.sum(pushed, axis=0)]
     if high is None:
         return np.outer(whole[0] + seen_by, whole[1] + pushed_by) / slack
     seen_high, pushed_high = high @ seen + seen_by, high @ pushed + pushed_by
@@ -307,7 +312,11 @@ def _beyond_bands(
     low, more = (BANDS + 0.5) * sampling, unknown.known
     at = _suprema(loop, low, np.inf, stiffness)
     pushed = np.einsum("ir,ir,irk->ik", sizes.enter, at.answer, sizes.pull).ravel()
-    pushed = pushed + unknown.enter * unknown.pull.ravel() * unknown.resonance / (3 * more**3)
+    pushed = (
+        pushed
+        + sizes.push / low**2
+        + unknown.enter * unknown.pull.ravel() * unknown.resonance / (3 * more**3)
+    )
     back = np.sum(sizes.enter * at.inertial * sizes.leave)
     back += unknown.enter * unknown.leave * unknown.resonance / more
     slack = 1 - sizes.spring / low**2 - back
@@ -320,7 +329,7 @@ def _beyond_bands(
     per_image = np.sqrt(2 * sampling / (np.sqrt(stiffness[0]) * unknown.omega))
     known = np.einsum("irk,ir,ir->ik", sizes.sense, at.inertial, sizes.leave).ravel()
     resonant = 3 * unknown.sense.ravel() * unknown.leave * unknown.resonance * per_image
-    seen = cubes * known + fuller * resonant
+    seen = cubes * (sizes.read + known) + fuller * resonant
     return cubes * (_direct(sizes, static + at.answer) + rest) + np.outer(seen, pushed) / slack
 
 
@@ -358,6 +367,7 @@ def _remainder(
 
 def _with_first_image(
     loop: ModalLoop,
+    sizes: _Sizes,
     unknown: _Unknown,
     first: _Band,
     high: Array,
@@ -365,8 +375,7 @@ def _with_first_image(
     payload: float,
     stiffness: tuple[float, float],
 ) -> Tail:
-    sizes, more = _sizes(loop, payload), unknown.known
-    scale = pose_scale(loop, payload)
+    more, scale = unknown.known, pose_scale(loop, payload)
     enter, leave = (np.abs(scale @ x) for x in (loop.enter, loop.leave))  # (n, p, R)
     soft = high * first.answer / loop.omega**2
     seen = high * (first.remainder if loop.exact is not None else first.answer)

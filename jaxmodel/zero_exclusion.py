@@ -1,10 +1,11 @@
 """Return difference of a sampled loop over whole cells of frequency and uncertain numbers.
 
-Unknowns are the pose, the low modes of each link and the commands m at one point of the unit
-circle; F is linear in them, and the loop has an eigenvalue there if and only if F is singular. For
-a cell, F is a disc of matrices (`jaxmodel.discs`): a centre and how far entries can move. If no
-member is singular on any cell of a box, and one point of the box is stable, then all of it is: the
-zero exclusion principle. docs/theory.md, "A proven box".
+Unknowns are the rigid part of p coordinates ("the pose" in short, with the elongations of links
+that lengthen), the low modes of each link and the commands m at one point of the unit circle; F is
+linear in them, and the loop has an eigenvalue there if and only if F is singular. For a cell, F is
+a disc of matrices (`jaxmodel.discs`): a centre and how far entries can move. If no member is
+singular on any cell of a box, and one point of the box is stable, then all of it is: the zero
+exclusion principle. docs/theory.md, "A proven box".
 """
 
 from __future__ import annotations
@@ -36,13 +37,12 @@ COORDINATES = ("nu", "stiffness", "delay", "payload", "gain")
 class Exclusion(NamedTuple):
     """A loop prepared for a box."""
 
-    loop: ModalLoop  # NumPy arrays, the pose in coordinates of unit mass
+    loop: ModalLoop  # NumPy arrays, the rigid part in coordinates of unit mass
     law: LawPoles
     tail: Tail  # sizes zero: the model's modes only
     base: int  # modes that are evaluated
     low: int  # of them, those that are unknowns of F
-    rest: Array  # static answer of the modes beyond the low ones, (3, K, K)
-    payload: tuple[float, float]  # middle and half-width of the box [kg]
+    rest: Array  # static answer beside the low modes, (3, K, K)
     images: list[Array]  # of the tail, maxima over 1, 2, 4, ... slices
 
 
@@ -86,8 +86,12 @@ def prepare_exclusion(
         payload_mass=reduced(loop.payload_mass),
         damping=reduced(loop.damping),
         stiffness=reduced(loop.stiffness),
+        axial_damping=reduced(loop.axial_damping),
+        axial_stiffness=reduced(loop.axial_stiffness),
         enter=scale @ loop.enter,
         leave=scale @ loop.leave,
+        push=scale @ loop.push,
+        read=loop.read @ scale.T,
     )
     return Exclusion(
         loop=scaled,
@@ -96,7 +100,6 @@ def prepare_exclusion(
         base=base,
         low=low,
         rest=static_rest(loop, low),
-        payload=((payload[0] + payload[1]) / 2, (payload[1] - payload[0]) / 2),
         images=maxima_over_slices(tail.images),
     )
 
@@ -134,7 +137,7 @@ def return_difference(setup: Exclusion, low: Array, high: Array) -> Disc:
     omega = interval(*ends)
     mechanical = _mechanics(setup, nu, stiffness, root, payload)
     chains = [_chain(setup.loop, omega, delay, image) for image in range(-NEAR, NEAR + 1)]
-    by_voltage, by_pose, by_mode = _sensors(setup, nu, stiffness, root, omega, chains)
+    by_voltage, by_pose, by_mode = _sensors(setup, nu, stiffness, root, payload, omega, chains)
     law = law_response(setup.law, omega, period)
     size = by_voltage.mid.shape[1]
     per_stiffness = stiffness.inverse()
@@ -200,6 +203,18 @@ def _resonance(
     return _Resonance(x2, denominator, denominator.inverse(least))
 
 
+def _mass(loop: ModalLoop, payload: Disc) -> Disc:
+    return Disc(loop.mass + 0j, 0 * loop.mass) + _lift(payload).scaled(loop.payload_mass)
+
+
+def _springs(loop: ModalLoop, nu: Disc, root: Disc, stiffness: Disc) -> Disc:
+    """Forces of drives and of links along themselves, by pose and over E, (cells, p, p)."""
+    drive = _lift(nu * root.inverse()).scaled(1j * loop.damping)
+    drive = drive + _lift(stiffness.inverse()).scaled(loop.stiffness)
+    along = _lift(nu * root).scaled(1j * loop.axial_damping)
+    return drive + along + Disc(loop.axial_stiffness, 0 * loop.axial_stiffness)
+
+
 def _mechanics(setup: Exclusion, nu: Disc, stiffness: Disc, root: Disc, payload: Disc) -> Disc:
     """Rows of the pose and of the low modes; columns: pose, low modes, commands."""
     loop, low, tail = setup.loop, setup.low, setup.tail
@@ -209,21 +224,7 @@ def _mechanics(setup: Exclusion, nu: Disc, stiffness: Disc, root: Disc, payload:
     size = first + links * patches
     mid, rad = np.zeros((n, first, size), complex), np.zeros((n, first, size))
     nu2 = _lift(_square(nu))
-    mass = Disc(
-        loop.mass + payload.mid[:, None, None] * loop.payload_mass,
-        payload.rad[:, None, None] * np.abs(loop.payload_mass),
-    )
-    softness = stiffness.inverse()
-    ratio = nu * root.inverse()
-    pose = (mass * nu2).scaled(-1.0)
-    pose = pose + Disc(
-        1j * ratio.mid[:, None, None] * loop.damping,
-        ratio.rad[:, None, None] * np.abs(loop.damping),
-    )
-    pose = pose + Disc(
-        softness.mid[:, None, None] * loop.stiffness,
-        softness.rad[:, None, None] * np.abs(loop.stiffness),
-    )
+    pose = _springs(loop, nu, root, stiffness) + (_mass(loop, payload) * nu2).scaled(-1.0)
     high = _resonance(setup, nu, stiffness, low, setup.base)
     enter, leave = loop.enter[:, :, low : setup.base], loop.leave[:, :, low : setup.base]
     pull = loop.actuator[:, low : setup.base] / loop.omega[:, low : setup.base, None] ** 2
@@ -234,7 +235,7 @@ def _mechanics(setup: Exclusion, nu: Disc, stiffness: Disc, root: Disc, payload:
     forced = Disc(*(x.reshape(n, p, -1) for x in forced)) * nu2.scaled(-1.0)
     reach = nu2.mid + nu2.rad
     mid[:, :p, :p], rad[:, :p, :p] = pose.mid, pose.rad + reach**2 * tail.pose_by_pose
-    mid[:, :p, first:] = forced.mid
+    mid[:, :p, first:] = forced.mid - loop.push
     rad[:, :p, first:] = forced.rad + reach * tail.pose_by_voltage
     own = _resonance(setup, nu, stiffness, 0, low, is_inverted=False)
     for i in range(links):
@@ -297,7 +298,13 @@ def _chain(loop: ModalLoop, omega: Disc, delay: Disc, image: int) -> Disc:
 
 
 def _sensors(
-    setup: Exclusion, nu: Disc, stiffness: Disc, root: Disc, omega: Disc, chains: list[Disc]
+    setup: Exclusion,
+    nu: Disc,
+    stiffness: Disc,
+    root: Disc,
+    payload: Disc,
+    omega: Disc,
+    chains: list[Disc],
 ) -> tuple[Disc, Disc, Disc]:
     """Sampled voltages times E by commands, pose and low modes, (cells, U, U or p or n J)."""
     loop, tail, low, base = setup.loop, setup.tail, setup.low, setup.base
@@ -311,13 +318,13 @@ def _sensors(
     blocks = Disc(blocks.mid + _rest_of(setup, base), blocks.rad)
     direct = _on_diagonal(blocks)
     direct = Disc(direct.mid, direct.rad + tail.sensor) * first
-    whole = _near_images(setup, omega, root, stiffness, chains, pull)
+    whole = _near_images(setup, omega, root, stiffness, payload, chains, pull)
     left_out = largest_over(setup.images, omega, float(loop.period))
     direct = Disc(direct.mid + whole.mid, direct.rad + whole.rad + left_out)
     turned = _over_modes("ikr,cir,ipr->cikp", sense, high.inverse * high.x2, leave)
     by_pose = Disc(*(x.reshape(n, size, len(loop.mass)) for x in turned))
     reach = (nu.mid + nu.rad)[:, None, None] ** 2
-    by_pose = Disc(by_pose.mid, by_pose.rad + reach * tail.sensor_by_pose) * first
+    by_pose = Disc(by_pose.mid + loop.read, by_pose.rad + reach * tail.sensor_by_pose) * first
     seen = np.zeros((size, links * low))
     for i in range(links):
         seen[i * patches : (i + 1) * patches, i * low : (i + 1) * low] = loop.sensor[i, :, :low]
@@ -325,10 +332,10 @@ def _sensors(
 
 
 def _rest_of(setup: Exclusion, base: int) -> Array:
-    """Static answer beyond the base modes, (3, K, K)."""
+    """Static answer beside the base modes, (3, K, K)."""
     loop, modes = setup.loop, slice(setup.low, base)
     if loop.exact is None:
-        return np.zeros_like(setup.rest)
+        return setup.rest
     soft = 1 / loop.omega[:, modes] ** 2
     return setup.rest - np.einsum(
         "ikr,ir,irl->ikl", loop.sensor[:, :, modes], soft, loop.actuator[:, modes]
@@ -336,7 +343,13 @@ def _rest_of(setup: Exclusion, base: int) -> Array:
 
 
 def _near_images(
-    setup: Exclusion, omega: Disc, root: Disc, stiffness: Disc, chains: list[Disc], pull: Array
+    setup: Exclusion,
+    omega: Disc,
+    root: Disc,
+    stiffness: Disc,
+    payload: Disc,
+    chains: list[Disc],
+    pull: Array,
 ) -> Disc:
     """Near images, from commands to sampled voltages times E, (cells, U, U)."""
     loop, base = setup.loop, setup.base
@@ -350,7 +363,9 @@ def _near_images(
         sense, pulled = loop.sensor[:, :, :base], pull[:, :base]
         blocks = _over_modes("ikr,cir,irl->cikl", sense, each.inverse, pulled)
         blocks = Disc(blocks.mid + _rest_of(setup, base), blocks.rad)
-        part = _on_diagonal(blocks) + _through_pose(setup, each, at, root, stiffness, pulled)
+        springs = _springs(loop, at, root, stiffness)
+        mass = _mass(loop, payload)
+        part = _on_diagonal(blocks) + _through_pose(setup, each, at, mass, springs, pulled)
         if image < 0:  # evaluated at -omega
             part = Disc(np.conj(part.mid), part.rad)
         part = part * _lift(chain)
@@ -360,31 +375,23 @@ def _near_images(
 
 
 def _through_pose(
-    setup: Exclusion, each: _Resonance, nu: Disc, root: Disc, stiffness: Disc, pull: Array
+    setup: Exclusion, each: _Resonance, nu: Disc, mass: Disc, springs: Disc, pull: Array
 ) -> Disc:
     """From voltage to pose to sensor of the base modes, (cells, U, U).
 
-    (M + sum enter x^2 leave/D) p = -sum enter pull/D u; the drive's forces on the pose are bounded.
+    (M - springs/nu^2 + sum enter x^2 leave/D) p = -(push/nu^2 + sum enter pull/D) u.
     """
     loop, base, n = setup.loop, setup.base, len(nu.mid)
     enter, leave = loop.enter[:, :, :base], loop.leave[:, :, :base]
     moved = each.inverse * each.x2
     own = _over_modes("ipr,cir,iqr->cpq", enter, moved, leave)
-    slowest = (nu.mid - nu.rad)[:, None, None]
-    rigid = np.abs(loop.damping) / slowest / (root.mid - root.rad)[:, None, None]
-    rigid = (
-        rigid + np.abs(loop.stiffness) / slowest**2 / (stiffness.mid - stiffness.rad)[:, None, None]
-    )
-    middle, added = setup.payload
-    whole = Disc(
-        own.mid + loop.mass + middle * loop.payload_mass,
-        own.rad + rigid + added * np.abs(loop.payload_mass),
-    )
+    slowness = _lift(_square(nu).inverse())
+    whole = own + mass + (springs * slowness).scaled(-1.0)
     pushed = _over_modes("ipr,cir,irk->cpik", enter, each.inverse, pull)
     seen = _over_modes("ikr,cir,ipr->cikp", loop.sensor[:, :, :base], moved, leave)
     p = len(loop.mass)
-    pushed = Disc(*(x.reshape(n, p, -1) for x in pushed))
-    seen = Disc(*(x.reshape(n, -1, p) for x in seen))
+    pushed = Disc(*(x.reshape(n, p, -1) for x in pushed)) + slowness.scaled(loop.push)
+    seen = Disc(*(x.reshape(n, -1, p) for x in seen)) + Disc(loop.read, 0 * loop.read)
     return (seen @ inverse_of(whole) @ pushed).scaled(-1.0)
 
 
