@@ -35,10 +35,10 @@ class Tail(NamedTuple):
     nu = omega/sqrt(E), and for coordinates times E.
     """
 
-    # from command to sampled voltage, times E, chain included, by slices of omega, (slices, U, U)
+    # from command to sampled voltage, times E, chain included, by slices of omega, at image 0 what
+    # modes answer at once, (slices, U, U)
     images: Array
-    sensor: Array  # the rest at image 0, chain excluded: from voltage, (U, U)
-    sensor_by_pose: Array  # from pose, (U, p)
+    sensor_by_pose: Array  # the rest at image 0, chain excluded: sensors from pose, (U, p)
     pose_by_voltage: Array  # force on the pose from voltage, (p, U)
     pose_by_pose: Array  # from pose, per nu^4, (p, p)
 
@@ -106,6 +106,8 @@ def bound_tail(
             if part is None:
                 return None
             total[k : k + width] += part
+    for k in range(SLICES):
+        total[k] += _first_image(loop, sizes, unknown, (edges[k], edges[k + 1]), stiffness, high)
     rest = _static_rest(loop, base)
     far = _beyond_bands(loop, sizes, unknown, high * (loop.exact is not None), rest, stiffness)
     if far is None:
@@ -134,6 +136,23 @@ def _one_image(
         seen = seen + (1 - high) * at.answer
         part = part + _static_rest(loop, int(np.sum(high == 0)))
     return _chain(loop, span[0]) * (part + _direct(sizes, seen))
+
+
+def _first_image(
+    loop: ModalLoop,
+    sizes: _Sizes,
+    unknown: _Unknown,
+    span: tuple[float, float],
+    stiffness: tuple[float, float],
+    high: Array,
+) -> Array:
+    """Direct answers at image 0 over a span of omega, where hold and filters are at most 1."""
+    at = _suprema(loop, *span, stiffness)
+    seen = high * (at.remainder if loop.exact is not None else at.answer)
+    x = np.asarray(span[1] / unknown.omega / unknown.known**2 / np.sqrt(stiffness[0]))
+    distance, size = _remainder(loop, unknown, x, stiffness)
+    compliance = np.einsum("ik,il->ikl", unknown.sense, unknown.pull) / unknown.known
+    return _direct(sizes, seen) + _on_diagonal(compliance) * (distance / size)
 
 
 class _Band(NamedTuple):
@@ -378,10 +397,8 @@ def _with_first_image(
     more, scale = unknown.known, pose_scale(loop, payload)
     enter, leave = (np.abs(scale @ x) for x in (loop.enter, loop.leave))  # (n, p, R)
     soft = high * first.answer / loop.omega**2
-    seen = high * (first.remainder if loop.exact is not None else first.answer)
     x = np.asarray((0.5 + OVERLAP) * 2 * np.pi / float(loop.period) / unknown.omega / more**2)
-    distance, size = _remainder(loop, unknown, x / np.sqrt(stiffness[0]), stiffness)
-    compliance = np.einsum("ik,il->ikl", unknown.sense, unknown.pull) / more
+    _, size = _remainder(loop, unknown, x / np.sqrt(stiffness[0]), stiffness)
     rare = 1 / (3 * more**3 * unknown.omega**2 * size)
     by_pose = np.einsum("irk,ir,ipr->ikp", sizes.sense, soft, leave)
     by_pose = by_pose.reshape(-1, len(scale))
@@ -390,7 +407,6 @@ def _with_first_image(
     own = unknown.enter * unknown.leave / (5 * more**5 * unknown.omega**2 * size)
     return Tail(
         images=images,
-        sensor=_direct(sizes, seen) + _on_diagonal(compliance) * (distance / size),
         sensor_by_pose=by_pose + rare * unknown.leave * unknown.sense.reshape(-1, 1),
         pose_by_voltage=by_voltage + unknown.enter * unknown.pull.ravel() / (3 * more**3 * size),
         pose_by_pose=np.einsum("ipr,ir,iqr->pq", enter, soft, leave) + own,

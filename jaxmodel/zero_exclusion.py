@@ -316,8 +316,7 @@ def _sensors(
     first = _lift(chains[NEAR])
     blocks = _over_modes("ikr,cir,irl->cikl", sense, high.inverse, pull[:, low:base])
     blocks = Disc(blocks.mid + _rest_of(setup, base), blocks.rad)
-    direct = _on_diagonal(blocks)
-    direct = Disc(direct.mid, direct.rad + tail.sensor) * first
+    direct = _on_diagonal(blocks) * first
     whole = _near_images(setup, omega, root, stiffness, payload, chains, pull)
     left_out = largest_over(setup.images, omega, float(loop.period))
     direct = Disc(direct.mid + whole.mid, direct.rad + whole.rad + left_out)
