@@ -38,7 +38,9 @@ class Tail(NamedTuple):
     # from command to sampled voltage, times E, chain included, by slices of omega, at image 0 what
     # modes answer at once, (slices, U, U)
     images: Array
-    sensor_by_pose: Array  # the rest at image 0, chain excluded: sensors from pose, (U, p)
+    # the rest at image 0, chain excluded: sensors from pose, (U, p), about half the static answer
+    # of known modes, so that any number of them is as near
+    sensor_by_pose: Array
     pose_by_voltage: Array  # force on the pose from voltage, (p, U)
     pose_by_pose: Array  # from pose, per nu^4, (p, p)
 
@@ -400,7 +402,8 @@ def _with_first_image(
     x = np.asarray((0.5 + OVERLAP) * 2 * np.pi / float(loop.period) / unknown.omega / more**2)
     _, size = _remainder(loop, unknown, x / np.sqrt(stiffness[0]), stiffness)
     rare = 1 / (3 * more**3 * unknown.omega**2 * size)
-    by_pose = np.einsum("irk,ir,ipr->ikp", sizes.sense, soft, leave)
+    away = high * (0.5 + np.minimum(first.remainder, first.answer)) / loop.omega**2
+    by_pose = np.einsum("irk,ir,ipr->ikp", sizes.sense, away, leave)
     by_pose = by_pose.reshape(-1, len(scale))
     by_voltage = np.einsum("ipr,ir,irk->pik", enter, high * first.answer, sizes.pull)
     by_voltage = by_voltage.reshape(len(scale), -1)

@@ -42,6 +42,7 @@ class Exclusion(NamedTuple):
     tail: Tail  # sizes zero: the model's modes only
     base: int  # modes that are evaluated
     low: int  # of them, those that are unknowns of F
+    middle: Array  # half the static answer of sensors to the pose beyond the base modes, (U, p)
     rest: Array  # static answer beside the low modes, (3, K, K)
     images: list[Array]  # of the tail, maxima over 1, 2, 4, ... slices
 
@@ -93,12 +94,15 @@ def prepare_exclusion(
         push=scale @ loop.push,
         read=loop.read @ scale.T,
     )
+    static = known.leave / loop.omega[:, None] ** 2
+    middle = np.einsum("ikr,ipr->ikp", known.sensor[..., base:], scale @ static[..., base:]) / 2
     return Exclusion(
         loop=scaled,
         law=law_poles(loop.law),
         tail=tail,
         base=base,
         low=low,
+        middle=middle.reshape(-1, len(scale)),
         rest=static_rest(loop, low),
         images=maxima_over_slices(tail.images),
     )
@@ -323,6 +327,7 @@ def _sensors(
     turned = _over_modes("ikr,cir,ipr->cikp", sense, high.inverse * high.x2, leave)
     by_pose = Disc(*(x.reshape(n, size, len(loop.mass)) for x in turned))
     reach = (nu.mid + nu.rad)[:, None, None] ** 2
+    by_pose = by_pose + _lift(_square(nu)).scaled(setup.middle)
     by_pose = Disc(by_pose.mid + loop.read, by_pose.rad + reach * tail.sensor_by_pose) * first
     seen = np.zeros((size, links * low))
     for i in range(links):
