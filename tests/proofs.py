@@ -9,6 +9,7 @@ import scipy.sparse.linalg
 
 from jaxmodel import sampled_loop
 from jaxmodel.linear import linearise, resting
+from jaxmodel.loop import coordinate_omega
 from jaxmodel.prepare import prepare
 from studies.engine.controller import fixed_controller
 from studies.engine.stability import gain_margin
@@ -75,9 +76,10 @@ def many_modes_loop(design, n_modes):
     state, enters, filtered, omega = (np.asarray(x) for x in _analogue(structure, case, pose))
     n, inputs, period = len(state), len(d), float(case.electronics.period)
     scale = np.ones(n)
-    scale[6 : 6 + 3 * n_modes] = 1 / omega.ravel()
-    corner = float(case.electronics.antialias)
-    scale[6 + 6 * n_modes :] = np.repeat([1.0, corner], inputs)[: n - 6 - 6 * n_modes]
+    rates = 6 + omega.size
+    scale[6:rates] = 1 / omega.ravel()
+    corner, filters = float(case.electronics.antialias), rates + omega.size
+    scale[filters:] = np.repeat([1.0, corner], inputs)[: n - filters]
     scale[3:6] = 100.0
     rate, shape = np.linalg.eig(state / scale[:, None] * scale)
     inward = np.linalg.inv(shape)
@@ -102,7 +104,7 @@ def _analogue(structure, case, pose):
     whole = sampled_loop.analogue_plant(structure, plant, case)
     inputs = whole.enters.shape[1] - 3
     filtered = jnp.arange(whole.state.shape[0])[whole.filtered]
-    return whole.state, whole.enters[:, :inputs], filtered, loop.omega
+    return whole.state, whole.enters[:, :inputs], filtered, coordinate_omega(loop)
 
 
 def spectral_radius(matrix):

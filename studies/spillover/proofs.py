@@ -224,6 +224,8 @@ def prove_box(design: FixedController, law: Controller, seconds: float) -> Prove
         return nothing._replace(fault=f"{basis}: its modes move the far ends of the links")
     if design.structure.has_wrench and not has_tail:
         return nothing._replace(fault=f"{basis} under a steady load: its modes change")
+    if design.structure.has_wrench and design.structure.has_stretch:
+        return nothing._replace(fault="links under a steady load: softer ones are longer at rest")
     radius = SpectralRadius(design, law, basis)
     corners = [(e, d, m) for e in BOX[0] for d in BOX[1] for m in BOX[2]]
     e, d, m = (sum(ends) / 2 for ends in BOX)

@@ -15,8 +15,15 @@ from jaxmodel import zero_exclusion
 from jaxmodel.branch_and_bound import Cells, exclude_zeros, start_cells
 from jaxmodel.controller import with_gains
 from jaxmodel.discs import Disc, excludes_zero, interval, inverse_of
+from jaxmodel.frequency_response import (
+    SampledLoopResponse,
+    command_gain,
+    plant_images,
+    plant_response,
+)
 from jaxmodel.modal_loop import law_poles, law_response
 from jaxmodel.mode_tail import bound_tail, static_rest
+from jaxmodel.prepare import prepare
 from jaxmodel.zero_exclusion import NEAR, prepare_exclusion, return_difference
 from studies.engine.controller import fixed_controller
 from studies.engine.stability import gain_margin
@@ -47,13 +54,15 @@ from studies.spillover.proofs import (
 )
 from studies.spillover.report import document, report, verdict
 from tests.pages import text_of
-from tests.proofs import ONE_MOVE as STUDY
-from tests.proofs import many_modes_loop, random_design, spectral_radius
+from tests.proofs import ONE_MOVE, many_modes_loop, random_design, spectral_radius
+
+STUDY = ONE_MOVE.change(link__stretch=False)
 
 
 @pytest.fixture(scope="module")
-def design():
-    return fixed_controller(STUDY)
+def design(request):
+    """Of links that lengthen, unless a test says otherwise."""
+    return fixed_controller(STUDY.change(link__stretch=getattr(request, "param", True)))
 
 
 @pytest.fixture(scope="module")
@@ -137,6 +146,7 @@ def test_resonances_of_a_link_that_differs_are_its_own(changed):
 # --- the return difference ------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("design", [True, False], indirect=True)
 @mock.patch.object(zero_exclusion, "NEAR", 12)  # part of no program
 def test_the_return_difference_is_that_of_the_eigenvalue_problem(design, law, loop):
     """det F with and without gains, against det(z - A) of the exact discretisation.
@@ -258,6 +268,90 @@ def test_the_tail_covers_the_modes_left_out(design, law, has_correction):
     assert largest > 0.05  # the bound is not idle
 
 
+@pytest.fixture(scope="module")
+def plant(design):
+    """Its response with 200 modes a link."""
+    structure = plant_structure(design, SINES, KNOWN)
+    initial = design.case.initial._replace(modal=np.zeros((3, KNOWN)))
+    case = design.case._replace(initial=initial, n_modes=jnp.asarray(KNOWN))
+    pose = np.array(STUDY.motion.waypoints[0])
+
+    @jax.jit
+    def respond(case):
+        return plant_response(structure, case, prepare(structure, case).loop, pose)
+
+    return respond(case)
+
+
+#: Frequencies at which single points are compared [Hz].
+HERTZ = np.array([8.0, 113.0, 460.0, 1200.0, 1240.0, 2410.0, 4700.0])
+
+
+def points(gain):
+    """Cells without width at `HERTZ`, of the study's machine."""
+    return np.stack([2 * np.pi * HERTZ, *(0 * HERTZ + x for x in (1.0, 0.0, 0.0, gain))], axis=1)
+
+
+def test_the_return_difference_is_that_of_the_frequency_response(design, law, loop, plant):
+    """det(I - law_v/z) det(I + L), but for images beyond the near ones."""
+    setup = prepare_exclusion(loop, KNOWN, (1.0, 1.0), (0.0, 0.0), has_tail=False)
+    law, period = jax.tree.map(jnp.asarray, law), float(loop.period)
+    with_it, without = (
+        np.linalg.det(return_difference(setup, points(gain), points(gain)).mid)
+        for gain in (1.0, 0.0)
+    )
+    omega = 2 * np.pi * HERTZ
+    response = SampledLoopResponse(plant, law)
+    gains = jax.lax.map(lambda x: command_gain(response, x), omega)
+    direct = law_response(setup.law, Disc(omega, 0 * omega), period).mid[:, :, 9:]
+    late = np.exp(-1j * omega * period)[:, None, None]
+    wanted = np.linalg.det(np.eye(9) - direct * late) * np.linalg.det(np.eye(9) + gains)
+    np.testing.assert_allclose(with_it / without, wanted, rtol=3e-3)
+
+
+@jax.jit
+def sampled_response(plant):
+    """Sum over 200 images on either side without delay, 200 modes, (points, 9, 9)."""
+    order = np.arange(-200, 201)
+    return jax.lax.map(lambda x: plant_images(plant, x, order).sensed.sum(0), 2 * np.pi * HERTZ)
+
+
+def uncovered(loop, plant):
+    """Entries of F of 200 modes and 200 images on either side, less its disc's centre over radii.
+
+    For a law that commands what sensors read: then F has 1 less the plant's response as its Schur
+    complement, and images beyond the near ones are what that lacks with 200 modes.
+    """
+    law = (np.zeros((1, 1)), np.zeros((1, 18)), np.zeros((9, 1)), np.eye(9, 18))
+    one, cell = ((1.0, 1.0), (0.0, 0.0)), points(1.0)
+    bounded = prepare_exclusion(loop._replace(law=law), LARGEST, *one, has_tail=True)
+    known = prepare_exclusion(loop._replace(law=law), KNOWN, *one, has_tail=False)
+    known = known._replace(low=bounded.low, rest=static_rest(loop, bounded.low))
+    bound, exact = (return_difference(x, cell, cell) for x in (bounded, known))
+    exact = exact.mid
+    late = np.exp(-2j * np.pi * HERTZ * float(loop.period))[:, None, None]
+    rigid, forced = exact[:, :-9, :-9], exact[:, :-9, -9:]
+    schur = exact[:, -9:, -9:] - exact[:, -9:, :-9] @ np.linalg.solve(rigid, forced)
+    exact[:, -9:, -9:] += np.eye(9) - late * sampled_response(plant) - schur
+    # rounding of the frequency response
+    return np.abs(exact - bound.mid) / (bound.rad + 1e-9 * np.abs(bound.mid) + 1e-12)
+
+
+@pytest.mark.parametrize("has_correction", [True, False])
+def test_the_tail_covers_modes_and_images(loop, plant, has_correction):
+    """Against brute force; a part of the elongations' path that is left out is not covered."""
+    held = {"exact": loop.exact - loop.held}
+    if not has_correction:
+        loop, plant = loop._replace(exact=None), plant._replace(direct=jnp.asarray(loop.held))
+        held = {"held": 0 * loop.held}
+    share = uncovered(loop, plant)
+    assert share.max() <= 1 and share[:, -9:, -9:].max() > 0.1
+    for name in ("push", "read", "axial_stiffness", "axial_damping"):
+        without = loop._replace(**{name: 0 * getattr(loop, name)})
+        assert uncovered(without, plant)[:, -9:].max() > 1, name
+    assert uncovered(loop._replace(**held), plant).max() > 1
+
+
 def with_known(loop, count):
     """The loop with fewer modes known one by one."""
     first = {name: getattr(loop, name)[:, :count] for name in ("omega", "spring", "zeta")}
@@ -351,6 +445,25 @@ def test_a_box_with_an_unstable_corner_is_not_proven(design):
     other = fixed_controller(study)
     box = prove_box(other, pad_channels(other.controller, other.n_patches), 20.0)
     assert not box.is_proven and box.unstable is not None
+
+
+def test_a_box_of_stretching_links_under_a_steady_load_is_not_proven(design):
+    """Their length at rest depends on their stiffness, which the bounds leave out."""
+    pulled = fixed_controller(design.study.change(load__wrench=(10.0, 0.0, 0.0)))
+    box = prove_box(pulled, pad_channels(pulled.controller, pulled.n_patches), 20.0)
+    assert not box.is_proven and "steady load" in box.fault
+
+
+@pytest.mark.parametrize(("gain", "is_proven"), [(0.3, True), (1.0, False)])
+def test_boxes_of_stretching_links_with_patches(design, gain, is_proven):
+    """Proven where machines are stable; those of the default gains are not with a sample more."""
+    changes = {"link__basis": "loaded", "control__gain_factor": gain}
+    patched = fixed_controller(design.study.change(**changes))
+    law = pad_channels(patched.controller, patched.n_patches)
+    box = prove_box(patched, law, 30.0)
+    radius, rng = SpectralRadius(patched, law, "loaded"), np.random.default_rng(0)
+    radii = [radius(*(rng.uniform(*ends) for ends in BOX)) for _ in range(5)]
+    assert box.is_proven == is_proven == (max(radii) < 1)
 
 
 # --- designs --------------------------------------------------------------------------------------
