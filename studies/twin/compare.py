@@ -13,7 +13,7 @@ from studies.engine.controller import check_codable
 from studies.engine.preflight import check_run
 from studies.engine.runs import Run, run_study, uncontrolled_twin
 from studies.errors import StudyError, field_error
-from studies.study.cases import build_structure
+from studies.study.cases import build_structure, has_stretch
 from studies.study.labels import describe
 from studies.study.spec import Study
 from studies.twin.law import exported_law
@@ -249,11 +249,12 @@ def causes(bench: TwinBench, ours: tuple[Run, Run], base: BothRuns) -> list[Chan
     """
     window, settings, study = in_window(bench.plan), bench.settings, bench.study
     found = [cause("as they are", base.free, base.controlled, window)]
-    for text, changed in (
-        ("twin: links 1000 times stiffer in tension", {"axial_factor": 1000.0}),
-        ("twin: twice the elements", {"n_elements": 2 * settings.n_elements}),
-        ("twin: half the step", {"n_steps": 2 * bench.plan.n_steps}),
-    ):
+    changes = {
+        "twin: links 1000 times stiffer in tension": {"axial_factor": 1000.0},
+        "twin: twice the elements": {"n_elements": 2 * settings.n_elements},
+        "twin: half the step": {"n_steps": 2 * bench.plan.n_steps},
+    }
+    for text, changed in list(changes.items())[has_stretch(study) :]:  # both may lengthen
         other = TwinBench(study, settings._replace(**changed))
         pairs = [pair(one, other.run(k == 0)) for k, one in enumerate(ours)]
         found.append(cause(text, pairs[1], pairs[0], window))

@@ -2,22 +2,23 @@
 
 `describe_machine(structure, case)` collects what a workshop drawing would say: rails and cranks,
 masses, sections of the links piece by piece, ends and constants of the patches. No modal basis is
-in it.
+in it, and laminates and patches are its own arithmetic: a section is layers of beam and ceramic
+about their common neutral axis; an actuator pushes with F = b_p E_p |d31| per volt at its distance
+from it, and a sensor's charge is F times what it lengthens at its own mid-plane.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.beam import BASES
 from jaxmodel.case import Case, Structure
 from jaxmodel.mechanisms.carriers import Carrier
 from jaxmodel.parameters import Array, Beam, Damping, Machine, Patches
-from jaxmodel.piezo import actuator_constant, patch_ends, sensor_constant
-from jaxmodel.static import link_pieces, section_stiffness
+from jaxmodel.piezo import VACUUM_PERMITTIVITY
+from jaxmodel.stretch import REFERENCE
 
 #: Cuts of a link closer than this share of its length are one [1].
 SAME_CUT = 1e-6
@@ -30,6 +31,7 @@ class LinkSections(NamedTuple):
     bending: np.ndarray  # E I [N m2]
     axial: np.ndarray  # E A [N]
     line_mass: np.ndarray  # rhoA [kg/m]
+    moment: np.ndarray  # of each actuator there [N m/V], (K, n)
 
 
 class Link(NamedTuple):
@@ -41,7 +43,10 @@ class Link(NamedTuple):
     sensor_ends: np.ndarray  # from joint B [m], (K, 2)
     actuator_ends: np.ndarray  # [m], (K, 2)
     sensor_constant: float  # lambda_s [V/rad]
-    actuator_constant: float  # lambda_a [N m/V]
+    actuator_constant: float  # lambda_a [N m/V], where no sensor is opposite
+    push: float  # of an actuator along the link [N/V]; 0: none
+    membrane: float  # of a sensor, less for each metre it gets longer with the link [V/m]
+    retardation: float  # of the link in tension, damper over spring [s]
     damping: Damping  # ratios of its modes between held ends, arrays of one link: (1, n), (1,), ()
 
 
@@ -84,7 +89,9 @@ def describe_machine(structure: Structure, case: Case) -> MachineData:
     machine, has_patches = case.machine, BASES[structure.basis].has_patches
     return MachineData(
         carriers=machine.geometry.carriers(machine.masses.slider_mass),
-        links=tuple(_link(machine, i, has_patches) for i in range(machine.n_links)),
+        links=tuple(
+            _link(machine, i, has_patches, structure.has_stretch) for i in range(machine.n_links)
+        ),
         platform=_platform(machine),
         is_locked=bool(np.any(case.drive.is_locked)),
     )
@@ -107,7 +114,7 @@ def _platform(machine: Machine) -> Platform:
     )
 
 
-def _link(machine: Machine, i: int, has_patches: bool) -> Link:
+def _link(machine: Machine, i: int, has_patches: bool, has_stretch: bool) -> Link:
     def own(value: Array) -> float:
         return float(np.broadcast_to(np.asarray(value), (machine.n_links,))[i])
 
@@ -116,14 +123,38 @@ def _link(machine: Machine, i: int, has_patches: bool) -> Link:
     center = np.asarray(every.pop("center"))[i]
     patches = Patches(center=center, **{name: own(value) for name, value in every.items()})
     damping = machine.damping
+    arm = (beam.thickness + patches.thickness) / 2
+    force = patches.width * patches.youngs_modulus * abs(patches.d31)
+    neutral = _laminate(beam, patches, np.array([patches.is_paired]), np.ones(1))[2].item()
+    constant = force * (1 + patches.is_paired) * (arm + neutral)
+    if patches.is_gauge:
+        arm = beam.thickness / 2 - neutral
+        volts = patches.bridge * patches.gauge_factor / patches.sensor_length
+    else:
+        volts = force / _capacitance(patches)
+    sensors, actuators = (
+        np.clip(center[:, None] + np.array([-0.5, 0.5]) * size, 0.0, beam.length)
+        for size in (patches.sensor_length, patches.actuator_length)
+    )
+    own_push = force * has_stretch * (1 - patches.is_paired)
     return Link(
         length=beam.length,
-        sections=_sections(beam, patches, has_patches),
+        sections=_sections(
+            beam,
+            patches,
+            (sensors, actuators),
+            constant,
+            own_push if has_patches else 0,
+            has_patches,
+        ),
         joint_inertia=(beam.joint_inertia_b, beam.joint_inertia_c) if has_patches else (0.0, 0.0),
-        sensor_ends=_ends(patches, patches.sensor_length, beam.length),
-        actuator_ends=_ends(patches, patches.actuator_length, beam.length),
-        sensor_constant=float(sensor_constant(beam, patches)),
-        actuator_constant=float(actuator_constant(beam, patches)),
+        sensor_ends=sensors,
+        actuator_ends=actuators,
+        sensor_constant=volts * arm,
+        actuator_constant=constant,
+        push=own_push,
+        membrane=volts * has_stretch,
+        retardation=2 * own(damping.stretch) / REFERENCE * has_stretch,
         damping=Damping(
             np.asarray(damping.ratio)[i : i + 1],
             np.asarray(damping.count)[i : i + 1],
@@ -132,23 +163,58 @@ def _link(machine: Machine, i: int, has_patches: bool) -> Link:
     )
 
 
-def _ends(patches: Patches, size: float, length: float) -> np.ndarray:
-    return np.clip(np.stack(patch_ends(patches.center, size), axis=1), 0.0, length)
+def _capacitance(patches: Patches) -> float:
+    """Of a sensor that is clamped [F]."""
+    free = patches.relative_permittivity * VACUUM_PERMITTIVITY
+    clamped = free - patches.d31**2 * patches.youngs_modulus
+    return float(clamped * patches.width * patches.sensor_length / patches.thickness)
 
 
-def _sections(beam: Beam, patches: Patches, has_patches: bool) -> LinkSections:
-    pieces = link_pieces(beam, patches._replace(center=jnp.asarray(patches.center)))
-    bending = section_stiffness(beam, patches, pieces, has_patches)
-    covers = np.asarray(jnp.sum(pieces.has_ceramic + pieces.has_actuator, axis=0))
-    covers = covers if has_patches else 0 * covers
-    area, patch_area = beam.width * beam.thickness, patches.width * patches.thickness
-    axial = beam.youngs_modulus * area + patches.youngs_modulus * patch_area * covers
-    line_mass = beam.density * area + patches.density * patch_area * covers
-    left, right = np.asarray(pieces.left), np.asarray(pieces.right)
-    is_there = right - left > SAME_CUT * beam.length
+def _laminate(
+    beam: Beam, patches: Patches, above: np.ndarray, below: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """A link's section with ceramic on its faces.
+
+    Args:
+        beam, patches: one link's numbers.
+        above, below: layers on the face of sensors, and on that of actuators, 0 or 1, (n,).
+
+    Returns:
+        (E A [N], E I [N m2], height of the neutral axis over the link's mid-plane [m]), (n,) each.
+    """
+    height = (beam.thickness + patches.thickness) / 2 * np.array([0.0, 1.0, -1.0])
+    depth = np.array([beam.thickness, patches.thickness, patches.thickness])
+    ceramic = patches.youngs_modulus * patches.width
+    layers = np.stack([np.ones_like(above), above, below], axis=1)
+    axial = layers * depth * [beam.youngs_modulus * beam.width, ceramic, ceramic]
+    whole = axial.sum(axis=1)
+    neutral = axial @ height / whole
+    bending = axial * ((height - neutral[:, None]) ** 2 + depth**2 / 12)
+    return whole, bending.sum(axis=1), neutral
+
+
+def _sections(
+    beam: Beam,
+    patches: Patches,
+    ends: tuple[np.ndarray, np.ndarray],
+    constant: float,
+    push: float,
+    has_patches: bool,
+) -> LinkSections:
+    """Between the ends of sensors and actuators; push: what acts at a neutral axis of its own."""
+    cuts = np.sort(np.concatenate([[0.0, beam.length], *(x.ravel() for x in ends)]))
+    is_there = np.diff(cuts) > SAME_CUT * beam.length
+    right, middle = cuts[1:][is_there], ((cuts[1:] + cuts[:-1]) / 2)[is_there]
+    seen, driven = (1.0 * ((x[:, :1] < middle) & (middle < x[:, 1:])) for x in ends)
+    above = np.maximum(seen * (1 - patches.is_gauge), driven * patches.is_paired).max(axis=0)
+    above, below = above * has_patches, driven.max(axis=0) * has_patches
+    axial, bending, neutral = _laminate(beam, patches, above, below)
+    arm = (beam.thickness + patches.thickness) / 2
+    ceramic = patches.density * patches.width * patches.thickness
     return LinkSections(
-        right=right[is_there],
-        bending=np.asarray(bending)[is_there],
-        axial=axial[is_there],
-        line_mass=line_mass[is_there],
+        right=right,
+        bending=beam.stiffness_factor * bending,
+        axial=beam.stiffness_factor * axial,
+        line_mass=beam.density * beam.width * beam.thickness + ceramic * (above + below),
+        moment=driven * (push * (arm + neutral) if push else constant),
     )

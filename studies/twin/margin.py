@@ -22,8 +22,11 @@ from studies.twin.ringing import ringing_poles
 #: Voltage of the pulse, on every actuator with a sign of its own, for one sample [V]: for decay,
 #: and, so that what grows stays far below the actuators' limits, for growth.
 PULSE, SMALL_PULSE = 10.0, 0.5
-#: How long a run rings [s].
-RINGING, CONFIRMING = 0.12, 0.16
+#: How long a run rings [s]; those that confirm a margin, at least, and at most.
+RINGING, CONFIRMING, LONGEST = 0.12, 0.16, 0.5
+#: They last until what grows or decays has done so by this exponent, or longer: by then other poles
+#: of nearly its frequency no longer beat with it [1].
+GROWN = 0.75
 #: Singular values of the signals below this share of the largest are noise: for all poles, and for
 #: those that are left late [1].
 ALL, LATE = 1e-8, 1e-6
@@ -127,9 +130,9 @@ class _Search:
         large = np.flatnonzero(np.abs(run.voltage).max(axis=(1, 2)) > LINEAR * limit)
         return max(int(large[0]) if len(large) else len(run.time), FEWEST)
 
-    def is_growing(self, factor: float) -> bool:
+    def is_growing(self, factor: float, duration: float) -> bool:
         """Whether voltages are larger in the last quarter of a run than in the one before."""
-        run = self.ring(factor, CONFIRMING)
+        run = self.ring(factor, duration)
         voltage = run.voltage[: self._last_linear(run)]
         quarter = len(voltage) // 4
         last, before = voltage[-quarter:], voltage[-2 * quarter : -quarter]
@@ -175,9 +178,10 @@ def margin_by_growth(
         low /= STRIDE
         below = search.pole(low, above)
     margin = low + (high - low) * below.real / (below.real - above.real)
-    is_confirmed = search.is_growing(margin * (1 + CONFIRMED)) and not search.is_growing(
-        margin * (1 - CONFIRMED)
-    )
+    rate = CONFIRMED * margin * (above.real - below.real) / (high - low)
+    duration = float(np.clip(GROWN / rate, CONFIRMING, LONGEST))
+    beyond, within = (margin * (1 + x) for x in (CONFIRMED, -CONFIRMED))
+    is_confirmed = search.is_growing(beyond, duration) and not search.is_growing(within, duration)
     return GrowthMargin(
         margin=float(margin),
         frequency=float(above.imag / (2 * np.pi)),

@@ -38,6 +38,7 @@ class Mesh(NamedTuple):
     middle: int  # node at mid-span
     sensor_nodes: np.ndarray  # at both ends of each sensor, (K, 2)
     actuator_nodes: np.ndarray  # (K, 2)
+    moment: np.ndarray  # of each actuator on each node [N m/V], (K, n + 1)
 
 
 def mesh_link(link: Link, n_elements: int) -> Mesh:
@@ -45,7 +46,8 @@ def mesh_link(link: Link, n_elements: int) -> Mesh:
 
     Args:
         link: the link.
-        n_elements: elements have at most the length of the link over this number.
+        n_elements: elements have at most the length of the link over this number, half of it
+            where patches push along the link.
     """
     middle = MID_SPAN * link.length
     cuts = np.sort(
@@ -55,6 +57,8 @@ def mesh_link(link: Link, n_elements: int) -> Mesh:
     )
     cuts = cuts[np.append(True, np.diff(cuts) > SAME_CUT * link.length)]
     size = link.length / n_elements * (1 + SAME_CUT)
+    if link.push:  # cables smear jumps of their strain, at the ends of patches, over an element
+        size /= 2
     parts = [np.linspace(a, b, int(np.ceil((b - a) / size)) + 1)[:-1] for a, b in pairwise(cuts)]
     x = np.append(np.concatenate(parts), link.length)
     piece = np.searchsorted(link.sections.right, (x[1:] + x[:-1]) / 2)
@@ -70,6 +74,7 @@ def mesh_link(link: Link, n_elements: int) -> Mesh:
         middle=int(node(middle)),
         sensor_nodes=node(link.sensor_ends),
         actuator_nodes=node(link.actuator_ends),
+        moment=-np.diff(link.sections.moment[:, piece], prepend=0.0, append=0.0),
     )
 
 

@@ -51,7 +51,8 @@ class Model(NamedTuple):
     carrier_start: tuple[int, ...]  # coordinate of each carrier, zero at the start
     levers: np.ndarray  # way of B over that coordinate, see `chain.lever`, (n,)
     platform_start: int  # first of (x, y, phi), or of (x, y)
-    moments: tuple[dict[int, int], ...]  # load number of each node with a patch end, by link
+    # numbers of the loads, force and moment, of each node with a patch end, by link
+    patch_loads: tuple[dict[int, tuple[int, int]], ...]
     platform_loads: tuple[int, ...]  # of force and, unless it is a point, moment at its reference
 
 
@@ -94,7 +95,7 @@ def build_model(
     meshes = tuple(mesh_link(link, settings.n_elements) for link in machine.links)
     levers = np.array([lever(carrier) for carrier in machine.carriers])
     platform = _add_platform(system, items, machine, pose)
-    nodes, carriers, moments = [], [], []
+    nodes, carriers, patch_loads = [], [], []
     for i, mesh in enumerate(meshes):
         own = _add_link(system, items, machine, mesh, i, ends[i], settings.axial_factor)
         carrier = _add_carrier(system, items, machine.carriers[i], ends[i, 0], own[0])
@@ -106,7 +107,7 @@ def build_model(
         system.AddObject(items.ObjectJointRevolute2D(markerNumbers=[platform.joints[i], joint]))
         nodes.append(own)
         carriers.append(carrier)
-        moments.append(_add_moments(system, items, mesh, own))
+        patch_loads.append(_add_patch_loads(system, items, mesh, own))
     system.Assemble()
 
     def start(node: int) -> int:
@@ -122,7 +123,7 @@ def build_model(
         carrier_start=tuple(map(start, carriers)),
         levers=levers,
         platform_start=start(platform.node),
-        moments=tuple(moments),
+        patch_loads=tuple(patch_loads),
         platform_loads=platform.loads,
     )
 
@@ -200,6 +201,7 @@ def _add_link(
                 massPerLength=mesh.line_mass[k],
                 bendingStiffness=mesh.bending[k],
                 axialStiffness=axial_factor * mesh.axial[k],
+                axialDamping=link.retardation * axial_factor * mesh.axial[k],
                 useReducedOrderIntegration=True,
             )
         )
@@ -278,12 +280,16 @@ def _to_ground(system: Any, items: Any, node: int) -> list[int]:
     ]
 
 
-def _add_moments(system: Any, items: Any, mesh: Mesh, nodes: list[int]) -> dict[int, int]:
-    """A moment, zero for now, at each end of an actuator."""
+def _add_patch_loads(
+    system: Any, items: Any, mesh: Mesh, nodes: list[int]
+) -> dict[int, tuple[int, int]]:
+    """A force and a moment, zero for now, at each end of an actuator or sensor."""
     loads = {}
-    for node in np.unique(mesh.actuator_nodes):
-        marker = system.AddMarker(items.MarkerNodeRigid(nodeNumber=nodes[node]))
-        loads[int(node)] = system.AddLoad(
-            items.LoadTorqueVector(markerNumber=marker, loadVector=[0, 0, 0])
+    for node in np.unique([mesh.actuator_nodes, mesh.sensor_nodes]).tolist():
+        at = system.AddMarker(items.MarkerNodePosition(nodeNumber=nodes[node]))
+        turned = system.AddMarker(items.MarkerNodeRigid(nodeNumber=nodes[node]))
+        loads[node] = (
+            system.AddLoad(items.LoadForceVector(markerNumber=at, loadVector=[0, 0, 0])),
+            system.AddLoad(items.LoadTorqueVector(markerNumber=turned, loadVector=[0, 0, 0])),
         )
     return loads

@@ -40,14 +40,16 @@ class Reader:
         return out
 
     def voltages(self) -> np.ndarray:
-        """Of the sensors: lambda_s times the difference of the slopes at their ends [V], (n, K)."""
+        """Of the sensors [V], (n, K): bent by the slopes at their ends, lengthened between them."""
         rows = []
         for i, (mesh, link) in enumerate(zip(self._model.meshes, self._machine.links, strict=True)):
-            slope = self._nodes(i)[mesh.sensor_nodes, 2:]  # (K, 2, 2)
+            place, slope = np.split(self._nodes(i)[mesh.sensor_nodes], 2, axis=2)  # (K, 2, 2)
+            longer = np.hypot(*(place[:, 1] - place[:, 0]).T) - np.diff(mesh.x[mesh.sensor_nodes]).T
             left, right = slope[:, 0], slope[:, 1]
             sine = left[:, 0] * right[:, 1] - left[:, 1] * right[:, 0]
             cosine = np.sum(left * right, axis=1)
-            rows.append(link.sensor_constant * np.arctan2(sine, cosine))
+            bent = link.sensor_constant * np.arctan2(sine, cosine)
+            rows.append(bent - link.membrane * longer[0])
         return np.stack(rows)
 
     def pose(self) -> np.ndarray:
@@ -60,20 +62,20 @@ class Reader:
         return np.array([*place - rotation(phi) @ platform.center, phi])
 
     def put_voltages(self, voltage: np.ndarray) -> None:
-        """Pairs of moments lambda_a V at the ends of the actuators from now on.
+        """Moments of the actuators, and pairs of forces along them at their ends, from now on.
 
         Args:
             voltage: [V], (n, K).
         """
         for i, (mesh, link) in enumerate(zip(self._model.meshes, self._machine.links, strict=True)):
-            moment = dict.fromkeys(self._model.moments[i], 0.0)
-            for (left, right), volts in zip(
-                mesh.actuator_nodes.tolist(), voltage[i].tolist(), strict=True
-            ):
-                moment[left] -= link.actuator_constant * volts
-                moment[right] += link.actuator_constant * volts
-            for node, size in moment.items():
-                self._set(self._model.moments[i][node], [0.0, 0.0, size])
+            moment, force = voltage[i] @ mesh.moment, np.zeros((len(mesh.x), 2))
+            place = self._nodes(i)[mesh.actuator_nodes, :2]  # (K, 2, 2)
+            along = place[:, 1] - place[:, 0]
+            along *= (link.push * voltage[i] / np.hypot(*along.T))[:, None]
+            np.add.at(force, mesh.actuator_nodes, np.stack([-along, along], axis=1))
+            for node, (push, turn) in self._model.patch_loads[i].items():
+                self._set(push, [*force[node].tolist(), 0.0])
+                self._set(turn, [0.0, 0.0, float(moment[node])])
 
     def put_wrench(self, wrench: np.ndarray) -> None:
         """Force on the platform's reference point and, unless it is a point, moment [N, N, N m]."""

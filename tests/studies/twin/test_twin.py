@@ -310,7 +310,7 @@ def test_a_margin_by_growth_is_confirmed_on_both_sides(monkeypatch, grows, is_co
         def pole(self, factor, near):
             return complex(10 * (factor - 2), 2000 * np.pi)
 
-        def is_growing(self, factor):
+        def is_growing(self, factor, duration):
             return grows(factor)
 
     monkeypatch.setattr(margin, "_Search", Search)

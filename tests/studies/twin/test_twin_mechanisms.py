@@ -159,11 +159,11 @@ def test_what_is_left_where_links_hardly_hold_the_platform_is_stretch():
     ours, real = both_frequencies("rrr unequal", "locked", np.zeros(3), stiffer=1e-3)
     assert (ours[0], real[0]) == (pytest.approx(114.1, abs=0.1), pytest.approx(91.0, abs=0.1))
     apart = []
-    for stiffer in (0.1, 1.0):
+    for stiffer in (0.1, 0.4):  # beyond it rounding shows
         ours, theirs = both_frequencies("rrr unequal", "locked", np.zeros(3), stiffer)
         apart.append((ours / theirs - 1)[1:3])
     assert np.all(apart[0] > 1e-4)
-    np.testing.assert_allclose(apart[0] / apart[1], 10, rtol=0.1)
+    np.testing.assert_allclose(apart[0] / apart[1], 4, rtol=0.1)
 
 
 @pytest.mark.parametrize("name", MACHINES)
