@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -249,7 +249,7 @@ def causes(bench: TwinBench, ours: tuple[Run, Run], base: BothRuns) -> list[Chan
     """
     window, settings, study = in_window(bench.plan), bench.settings, bench.study
     found = [cause("as they are", base.free, base.controlled, window)]
-    changes = {
+    changes: dict[str, dict[str, Any]] = {
         "twin: links 1000 times stiffer in tension": {"axial_factor": 1000.0},
         "twin: twice the elements": {"n_elements": 2 * settings.n_elements},
         "twin: half the step": {"n_steps": 2 * bench.plan.n_steps},

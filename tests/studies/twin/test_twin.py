@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import json
 import sys
+from functools import partial
 from types import SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import jsonschema
 import numpy as np
 import pytest
 import scipy.integrate
 
+from jaxmodel.beam import BASES, by_link
+from jaxmodel.piezo import actuator_constant, sensor_constant
+from jaxmodel.static import static_bending
+from jaxmodel.stretch import find_stretch
 from studies.engine.design import Design
 from studies.engine.preflight import check_run
+from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.reference.tables import frequencies
 from studies.show.document import json_text, schema
@@ -27,11 +35,21 @@ from studies.twin.machine import describe_machine
 from studies.twin.mesh import damping_matrix, held_modes, mesh_link
 from studies.twin.multibody import Settings, build_model
 from studies.twin.plan import SignalPath
+from studies.twin.reading import Reader
 from studies.twin.ringing import ringing_poles
 from studies.twin.run import twin_design
 from tests.studies.test_cli import refused, run
 
 HOME = np.array([0.0, 0.0, np.pi / 6])
+#: Links that lengthen, no two alike.
+LENGTHENING = {
+    "link__stretch": True,
+    "link__stretch_damping": 0.02,
+    "link__length": (0.2, 0.21, 0.19),
+    "link__thickness": (2e-3, 2.2e-3, 1.8e-3),
+    "patches__thickness": (1e-4, 2e-4, 3e-4),
+    "patches__centers": ((0.05, 0.10, 0.15), (0.055, 0.105, 0.15), (0.045, 0.095, 0.145)),
+}
 
 
 def needs_exudyn() -> None:
@@ -51,6 +69,114 @@ def test_mesh_has_nodes_at_patch_ends_and_modes_of_a_pinned_beam():
     omega, _ = held_modes(mesh, (0.0, 0.0))
     exact = (np.arange(1, 6) * np.pi / 0.2) ** 2 * np.sqrt(70e9 * 0.01 * 0.002**3 / 12 / 0.055)
     np.testing.assert_allclose(omega[:5], exact, rtol=2e-5)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"link__basis": "pinned_pinned"},
+        {"link__basis": "loaded"},
+        {"link__basis": "loaded", "patches__actuators": "both faces"},
+        {"link__basis": "loaded", "patches__sensor": "strain_gauge"},
+        {"link__basis": "loaded", "link__stretch": False},
+    ],
+)
+def test_patches_by_other_arithmetic_are_those_of_the_model(fields):
+    structure, case = check_run(Study().change(**LENGTHENING | fields))
+    machine = describe_machine(structure, case)
+    expected = _model_patches(structure, case)
+    rows = [_twin_patches(link) for link in machine.links]
+    if not structure.has_stretch:
+        assert all(link.push == link.membrane == link.retardation == 0 for link in machine.links)
+        rows, expected = [x[:3] for x in rows], expected[:3]
+    for found, wanted in zip(zip(*rows, strict=True), expected, strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-14 * np.abs(wanted).max())
+
+
+@partial(jax.jit, static_argnums=0)
+def _model_patches(structure, case):
+    """Constants of patches, slopes per voltage, stiffness in tension and what `Stretch` says."""
+    beam, patches, damping = case.machine.beam, case.machine.patches, case.machine.damping
+    has_patches = BASES[structure.basis].has_patches
+    lambda_s, lambda_a = (
+        jnp.broadcast_to(constant(beam, patches), 3)
+        for constant in (sensor_constant, actuator_constant)
+    )
+    links = by_link(beam, patches, jnp.zeros((1,)))[:2]
+    slope, _ = jax.vmap(lambda b, p: static_bending(b, p, jnp.zeros(1), has_patches))(*links)
+    own = find_stretch(beam, patches, damping, has_patches)
+    return (
+        lambda_s,
+        lambda_a,
+        slope * lambda_a[:, None, None],
+        own.stiffness,
+        own.damping,
+        own.free,
+        own.strain,
+        own.local,
+    )
+
+
+def _twin_patches(link):
+    """The same of the twin's drawing."""
+    sections = link.sections
+    left = np.append(0.0, sections.right[:-1])
+    size, middle = sections.right - left, (sections.right + left) / 2
+    seen, driven = (
+        (x[:, :1] < middle) & (middle < x[:, 1:]) for x in (link.sensor_ends, link.actuator_ends)
+    )
+    stiffness = 1 / np.sum(size / sections.axial)
+    return (
+        link.sensor_constant,
+        link.actuator_constant,
+        seen * size / sections.bending @ sections.moment.T,
+        stiffness,
+        link.retardation * stiffness,
+        link.push * driven @ (size / sections.axial),
+        -link.membrane * seen @ (size / sections.axial),
+        -link.membrane * link.push * (seen * size / sections.axial) @ driven.T,
+    )
+
+
+def test_a_sensor_reads_bending_less_what_it_lengthens_and_actuators_push_their_ends_apart():
+    """Of a straight link that lies askew, lengthened by 1 per mille, or bent to an arc."""
+    machine = machine_of(**LENGTHENING, link__basis="loaded")
+    machine = machine._replace(links=machine.links[:1])
+    (link,), mesh = machine.links, mesh_link(machine.links[0], 20)
+    along = np.array([0.6, 0.8])
+    pushed = {}
+    model = SimpleNamespace(
+        meshes=(mesh,),
+        link_start=(0,),
+        patch_loads=({node: (2 * node, 2 * node + 1) for node in range(len(mesh.x))},),
+        system=SimpleNamespace(SetLoadParameter=lambda load, _, size: pushed.update({load: size})),
+    )
+
+    def reader(place, slope):
+        model.reference = np.concatenate([place, slope], axis=1).ravel()
+        return Reader(model, machine)
+
+    slope = np.broadcast_to(along, (len(mesh.x), 2))
+    lengthened = reader(1.001 * mesh.x[:, None] * along, slope)
+    size = np.diff(link.sensor_ends)[:, 0]
+    np.testing.assert_allclose(lengthened.voltages()[0], -link.membrane * 1e-3 * size, rtol=1e-9)
+    turn = 1e-3 * mesh.x
+    arc = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    bent = reader(np.stack([np.sin(turn), 1 - np.cos(turn)], axis=1) / 1e-3, arc)
+    np.testing.assert_allclose(bent.voltages()[0], link.sensor_constant * 1e-3 * size, rtol=1e-5)
+
+    volts = np.array([[1.0, -2.0, 3.0]])
+    lengthened.put_voltages(volts)
+    force = np.array([pushed[2 * node] for node in range(len(mesh.x))])
+    moment = np.array([pushed[2 * node + 1] for node in range(len(mesh.x))])
+    middle = (mesh.x[1:] + mesh.x[:-1]) / 2
+    covers = (link.actuator_ends[:, :1] < middle) & (middle < link.actuator_ends[:, 1:])
+    tension = -np.cumsum(force[:-1, :2] @ along)  # that holds what is left of a cut
+    np.testing.assert_allclose(tension, link.push * volts[0] @ covers, atol=1e-12)
+    assert np.abs(force[:, :2] @ [-0.8, 0.6]).max() < 1e-12 * np.abs(force).max()
+    piece = np.searchsorted(link.sections.right, middle)
+    inside = volts[0] @ link.sections.moment[:, piece]
+    np.testing.assert_allclose(-np.cumsum(moment[:-1, 2]), inside, atol=1e-14)
 
 
 def test_damping_holds_the_ratios_and_leaves_rigid_motion_alone():
@@ -413,3 +539,26 @@ def test_the_square_is_the_same_in_both_models(fields, deflection, voltage, tmp_
     assert changes["both: an ADC that hardly rounds"].voltage < 4e-3
     assert result.growth.is_confirmed
     assert result.growth.margin == pytest.approx(float(result.loop.gain_margin), rel=1e-2)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("basis", ["pinned_pinned", "loaded"])
+def test_gain_margins_of_links_that_lengthen_are_the_same_in_both_models(basis):
+    needs_exudyn()
+    study = Study().change(link__stretch=True, link__basis=basis)
+    predicted = margin_of(study)
+    bench = compare.TwinBench(study, Settings(n_steps=20))
+    arguments = study, bench.machine, bench.plan, predicted, bench.settings
+    found = margin.margin_by_growth(*arguments)
+    assert found.is_confirmed
+    assert found.margin == pytest.approx(predicted, rel=0.01)
+    # what patches do along the links halves it
+    assert predicted < 0.6 * margin_of(study.change(link__stretch=False))
+
+
+def margin_of(study):
+    """By the linearised loop of the model."""
+    waypoint = np.asarray(study.motion.waypoints[0])
+    report = loop_report(build_structure(study), build_case(study), waypoint)
+    return float(report.gain_margin)
