@@ -4,7 +4,8 @@ A sampler sees the plant's responses at omega + 2 pi n/T, each weighed by hold a
 filter. The modes from a base number on, any number of them, answer there by a remainder beyond
 their static compliance; its largest size follows from the slopes of sines (at most j pi/L at an
 end of a patch), from modal compliances falling as 1/j^4, from the damping (1/(2 zeta) at
-resonance, wherever an image meets it), and from the coupling with the pose (b_j, c_j ~ 1/j). In the
+resonance, wherever an image meets it), and from the coupling with the pose (b_j, c_j ~ 1/j). Links
+that lengthen push on the rigid part at once, which follows as 1/omega^2 at far images. In the
 spirit of Selivanov and Fridman (2025), who treat a continuous loop of a PDE, here for a sampled
 loop of several channels. docs/theory.md, "All modes".
 """
@@ -290,8 +291,8 @@ def _through_pose(
             None: all modes.
     """
     more = unknown.known
-    stretch = (top / unknown.omega) ** 2 / stiffness[0]  # x^2 of mode j times j^4
-    slack = 1 - stretch / more**4 - unknown.spring / stiffness[0]
+    square = (top / unknown.omega) ** 2 / stiffness[0]  # x^2 of mode j times j^4
+    slack = 1 - square / more**4 - unknown.spring / stiffness[0]
     if unknown.leave > 0 and slack < 0.8:
         return None
     nonresonant = 1 / max(slack, 0.8)
@@ -300,8 +301,8 @@ def _through_pose(
     back = np.sum(sizes.enter * at.inertial * sizes.leave, axis=0)
     # of the modes that are not known one by one
     pushed_by = unknown.enter * unknown.pull.ravel() * nonresonant / (3 * more**3)
-    seen_by = unknown.sense.ravel() * unknown.leave * stretch * nonresonant / (3 * more**3)
-    back_by = unknown.enter * unknown.leave * stretch * nonresonant / (5 * more**5)
+    seen_by = unknown.sense.ravel() * unknown.leave * square * nonresonant / (3 * more**3)
+    back_by = unknown.enter * unknown.leave * square * nonresonant / (5 * more**5)
     slack = 1 - sizes.spring / low**2 - np.sum(back) - back_by
     if slack <= 0:
         return None
@@ -333,11 +334,8 @@ def _beyond_bands(
     low, more = (BANDS + 0.5) * sampling, unknown.known
     at = _suprema(loop, low, np.inf, stiffness)
     pushed = np.einsum("ir,ir,irk->ik", sizes.enter, at.answer, sizes.pull).ravel()
-    pushed = (
-        pushed
-        + sizes.push / low**2
-        + unknown.enter * unknown.pull.ravel() * unknown.resonance / (3 * more**3)
-    )
+    pushed += unknown.enter * unknown.pull.ravel() * unknown.resonance / (3 * more**3)
+    pushed += sizes.push / low**2
     back = np.sum(sizes.enter * at.inertial * sizes.leave)
     back += unknown.enter * unknown.leave * unknown.resonance / more
     slack = 1 - sizes.spring / low**2 - back
