@@ -61,6 +61,8 @@ class ModalBasis(NamedTuple):
     # exact static response to moments of the actuators, whatever the modes (`jaxmodel.static`)
     static_slope: Array  # slope differences over the sensors [rad/(N m)], (3, n_patches, n_patches)
     static_deflection: Array  # from the chord at `stations` [m/(N m)], (3, S, n_patches)
+    # elongation of a link per last coordinate, if that is no mode [1], (3,); None: all are modes
+    stretch: Array | None = None
 
 
 class Basis(NamedTuple):

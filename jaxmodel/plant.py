@@ -98,6 +98,8 @@ def build_plant(
     inertia = masses.platform_inertia + jnp.asarray(masses.payload_inertia)
     if offset is not None:
         inertia = inertia + payload * jnp.sum(jnp.asarray(offset) ** 2)
+    if stretch is not None:
+        basis = lengthening(basis, stretch)
     plant = Plant(
         legs=legs,
         joint_cos=None if arms is None else arms[0],
@@ -123,12 +125,27 @@ def build_plant(
         centrifugal=basis.centrifugal if has_shortening and is_distributed else None,
         b=basis.b,
         c=basis.c,
+        stretch=basis.stretch,
     )
-    return plant if stretch is None else _lengthening(plant, stretch)
+    if stretch is None or basis.stretch is None:
+        return plant
+    return plant._replace(
+        shortening=None if plant.shortening is None else plant.shortening[:, :-1],
+        mixed_shortening=None
+        if plant.mixed_shortening is None
+        else plant.mixed_shortening[:, :-1, :-1],
+        damping=plant.damping.at[:, -1].set(basis.stretch**2 * stretch.damping),
+    )
 
 
-def _lengthening(plant: Plant, stretch: Stretch) -> Plant:
-    scale = jnp.sqrt(plant.modal_mass / stretch.mass)
+def lengthening(basis: ModalBasis, stretch: Stretch) -> ModalBasis:
+    """A basis with one coordinate more, of the modes' modal mass: a link's elongation over a scale.
+
+    Args:
+        basis: of the links.
+        stretch: of the links.
+    """
+    scale = jnp.sqrt(basis.mass[:, 0] / stretch.mass)
 
     def beside(x: Array, value: Array = 0.0) -> Array:
         return jnp.pad(x, ((0, 0), (0, 1))).at[:, -1].set(value)
@@ -136,13 +153,15 @@ def _lengthening(plant: Plant, stretch: Stretch) -> Plant:
     def around(x: Array | None) -> Array | None:
         return None if x is None else jnp.pad(x, ((0, 0), (0, 1), (0, 1)))
 
-    return plant._replace(
-        stiffness=beside(plant.stiffness, scale**2 * stretch.stiffness),
-        damping=beside(plant.damping, scale**2 * stretch.damping),
-        inward=around(plant.inward),
-        centrifugal=around(plant.centrifugal),
-        b=beside(plant.b),
-        c=beside(plant.c),
+    return basis._replace(
+        mass=beside(basis.mass, basis.mass[:, 0]),
+        stiffness=beside(basis.stiffness, scale**2 * stretch.stiffness),
+        shortening=None if basis.shortening is None else beside(basis.shortening),
+        mixed_shortening=around(basis.mixed_shortening),
+        inward=around(basis.inward),
+        centrifugal=around(basis.centrifugal),
+        b=beside(basis.b),
+        c=beside(basis.c),
         stretch=scale,
     )
 

@@ -102,7 +102,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
     )
     design = design_controller(structure, case, bases)
     omega = jnp.sqrt(basis.stiffness / basis.mass)
-    split = _split(structure, case, plant, omega)
+    split = oscillators(structure, case, plant, omega)
     step = electronics.period / structure.substeps
     change = command_change(true_delay(electronics)) if structure.is_delayed else None
     after = step if change is None else (1 - change.share) * step
@@ -176,7 +176,7 @@ def stretch_of(structure: Structure, case: Case) -> Stretch | None:
     return find_stretch(machine.beam, machine.patches, machine.damping, basis.has_patches)
 
 
-def _split(structure: Structure, case: Case, plant: Plant, omega: Array) -> tuple[Array, ...]:
+def oscillators(structure: Structure, case: Case, plant: Plant, omega: Array) -> tuple[Array, ...]:
     """Oscillators that plant steps solve exactly: modes as they are, elongations as assembled.
 
     Between slider and platform an elongation vibrates at a fraction of the frequency of the link

@@ -10,12 +10,15 @@ from __future__ import annotations
 from functools import partial
 from typing import NamedTuple
 
+import numpy as np
+
 from jaxmodel.bases import station_places
 from jaxmodel.beam import build_basis, held_frequency, left_out_of_loads
 from jaxmodel.case import Case, Structure
 from jaxmodel.drive import Reference
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import drive_gains
+from jaxmodel.dynamics import modal_chain
 from jaxmodel.kinematics import close_chain
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.linear import flatten, linearise, resting
@@ -29,7 +32,8 @@ from jaxmodel.prepare import Prepared, prepare
 class BenchPlant(NamedTuple):
     """x' = A x + B_0 u + B_2 u'', y = C x + D u, with x = (X, X', q, q') about rest, (n,).
 
-    B_2: modes that are left out follow their forces at once, and their inertia moves the pose.
+    B_2: modes that are left out follow their forces at once, and their inertia moves the pose and
+    the elongations.
     """
 
     state: Array  # A [1/s and mixed], (n, n)
@@ -64,21 +68,28 @@ def bench_plant(structure: Structure, case: Case, pose: Array) -> BenchPlant:
     loop = prepared.loop
     pose = jnp.asarray(pose, loop.omega.dtype)
     plant = linearise(structure, loop, pose, resting(structure, case))
-    still = jnp.zeros_like(pose)
+    n, size = structure.n_pose, structure.n_links * structure.n_coordinates
+    still = jnp.zeros((n + size,), pose.dtype)
+    # rows that take positions y = (X, q) and accelerations from x and x' = (X', X'', q', q'')
+    eye = jnp.eye(2 * (n + size))
+    place = eye[np.r_[0:n, 2 * n : 2 * n + size]]
+    acceleration = eye[np.r_[n : 2 * n, 2 * n + size : 2 * (n + size)]]
 
-    def rho(at: Array) -> Array:
-        return close_chain(loop.plant, at, still).rho
+    def rho(y: Array) -> Array:
+        q = jnp.reshape(y, loop.plant.stiffness.shape)
+        return modal_chain(loop.plant, pose, 0 * pose, q, 0 * q).rho
 
-    n = structure.n_pose
-    others = (0, 0), (0, n + 2 * structure.n_links * structure.n_modes)
-    to_pose = jnp.pad(jnp.eye(n), others)
+    to_rho = jnp.concatenate(
+        [jax.jacfwd(lambda at: close_chain(loop.plant, at, 0 * at).rho)(pose)]
+        + [jax.jacfwd(rho)(still[n:])],
+        axis=1,
+    )
     across, along = jax.jacfwd(partial(_point_rates, loop, station_places(case), pose))(still)
     gains = drive_gains(DRIVES[structure.drive], loop.drive)
     hammer, wrench = _forces(structure, loop, case, pose)
     to_sensor, to_deflection = plant.direct_sensor, plant.direct_deflection
     left_out = _left_out(structure, case, prepared, pose)
-    # X'' is what is moved: the second part of x' = (X', X'', ..)
-    by_motion = left_out.by_motion @ jnp.eye(n, len(plant.state), n)
+    by_motion = left_out.by_motion @ acceleration
     moved = by_motion @ plant.state
     deflection = plant.deflection + moved[len(to_sensor) :]
     return BenchPlant(
@@ -88,10 +99,10 @@ def bench_plant(structure: Structure, case: Case, pose: Array) -> BenchPlant:
         hammer=jnp.stack([hammer, wrench @ left_out.hammer_wrench]),
         sensor=plant.sensor + moved[: len(to_sensor)],
         deflection=deflection,
-        across=jnp.reshape(across, (-1, n)) @ to_pose + deflection,
-        along=jnp.reshape(along, (-1, n)) @ to_pose,
-        slider=jnp.pad(jax.jacfwd(rho)(pose), others),
-        pose=to_pose,
+        across=jnp.reshape(across, (-1, n + size)) @ place + deflection,
+        along=jnp.reshape(along, (-1, n + size)) @ place,
+        slider=to_rho @ place,
+        pose=place[:n],
         from_actuator=jnp.concatenate([to_sensor, to_deflection]) + by_motion @ plant.voltage,
         from_slider_force=by_motion @ plant.force,
         from_hammer=left_out.by_force + by_motion @ hammer,
@@ -103,19 +114,20 @@ class _LeftOut(NamedTuple):
     """What modes that are left out do; zero where the model is truncated."""
 
     by_force: Array  # to sensors, then deflections, by forces at the stations, (3 (K + S), 3 S)
-    by_motion: Array  # the same by accelerations of the pose, (3 (K + S), 3)
-    hammer_wrench: Array  # on the pose per second derivative of such forces, (3, 3 S)
-    actuator_wrench: Array  # of the actuators' voltages, (3, 3 K)
+    by_motion: Array  # the same by accelerations of y = (X, q), (3 (K + S), m)
+    hammer_wrench: Array  # on y per second derivative of such forces, (m, 3 S)
+    actuator_wrench: Array  # of the actuators' voltages, (m, 3 K)
 
 
 def _left_out(structure: Structure, case: Case, prepared: Prepared, pose: Array) -> _LeftOut:
     loop, stations, k = prepared.loop, station_places(case), structure.n_patches
-    beam, patches, still = case.machine.beam, case.machine.patches, jnp.zeros_like(pose)
+    beam, patches = case.machine.beam, case.machine.patches
+    still = jnp.zeros((len(pose) + loop.plant.stiffness.size,), pose.dtype)
     loads = left_out_of_loads(structure.basis, beam, patches, stations, prepared.bases.plant)
     constants = sensor_constant(beam, patches), 1.0, actuator_constant(beam, patches)
     one = jnp.full((structure.n_links, 1), float(loop.left_out is not None))
     ends = one * jnp.array([0.0, 1.0])
-    # the motion across a link at its joint, and its change along the link, (3, 2, 3)
+    # the motion across a link at its joint, and its change along the link, (3, 2, m)
     across = jax.jacfwd(lambda rate: _point_rates(loop, ends, pose, rate)[0])(still)
     motion = -jnp.stack([across[:, 0], across[:, 1] - across[:, 0]], axis=1)
     volts, bent, driven = (
@@ -126,7 +138,7 @@ def _left_out(structure: Structure, case: Case, prepared: Prepared, pose: Array)
     )
 
     def beside(x: Array) -> Array:
-        return jnp.reshape(x[..., -2:] @ motion, (-1, len(pose)))
+        return jnp.reshape(x[..., -2:] @ motion, (-1, len(still)))
 
     return _LeftOut(
         jnp.concatenate([jax.scipy.linalg.block_diag(*x[..., :-2]) for x in (volts, bent)]),
@@ -137,40 +149,50 @@ def _left_out(structure: Structure, case: Case, prepared: Prepared, pose: Array)
 
 
 def _point_rates(loop: Loop, stations: Array, pose: Array, rate: Array) -> tuple[Array, Array]:
-    """Velocities of the stations of straight links, across and along them [m/s], (3, S) each."""
-    chain = close_chain(loop.plant, pose, rate)
+    """Velocities of the stations of straight links, across and along them [m/s], (3, S) each.
+
+    rate: of (X, q); modes bend no link here, elongations lengthen it evenly.
+    """
+    plant, n = loop.plant, len(pose)
+    q_rate = jnp.reshape(rate[n:], plant.stiffness.shape)
+    chain = modal_chain(plant, pose, rate[:n], 0 * q_rate, q_rate)
     across = stations * chain.beta_rate[:, None] - (chain.sine * chain.rho_rate)[:, None]
-    return across, jnp.broadcast_to((chain.cosine * chain.rho_rate)[:, None], across.shape)
+    along = jnp.broadcast_to((chain.cosine * chain.rho_rate)[:, None], across.shape)
+    if plant.stretch is not None:
+        along = along + stations * (plant.stretch * q_rate[:, -1] / plant.length)[:, None]
+    return across, along
 
 
 def _forces(structure: Structure, loop: Loop, case: Case, pose: Array) -> tuple[Array, Array]:
-    """Columns of B of unit forces across the links, (n, 3 S), and on the pose, (n, 3).
+    """Columns of B of unit forces across the links, (n, 3 S), and on y = (X, q), (n, m).
 
     A force at x does work on v_n = x gamma' - sin(gamma) rho' + sum Y_j(x) q_j': it is a wrench on
-    the platform, and a force on each mode.
+    the platform, and a force on each coordinate.
     """
-    stations, count = station_places(case), loop.deflection_at.shape[1]
-    still, zero = jnp.zeros_like(pose), jnp.zeros_like(loop.omega)
-
-    to_pose, _ = jax.jacfwd(partial(_point_rates, loop, stations, pose))(still)  # (3, S, 3)
-    # forces on modes enter where the actuators' do
-    on_modes = jnp.swapaxes(loop.deflection_at, 1, 2) / loop.plant.modal_mass[:, None, None]
-    pushed = loop._replace(actuator=on_modes)
+    stations, still, zero = station_places(case), 0 * pose, jnp.zeros_like(loop.plant.stiffness)
+    n, mass, links = len(pose), loop.plant.modal_mass[:, None, None], len(zero)
+    rates = jnp.zeros((n + zero.size,), pose.dtype)
+    across, _ = jax.jacfwd(partial(_point_rates, loop, stations, pose))(rates)  # (3, S, m)
+    # forces on coordinates enter where the actuators' do
+    pushed = loop._replace(
+        actuator=jnp.broadcast_to(jnp.eye(zero.shape[1]) / mass, (links, *[zero.shape[1]] * 2))
+    )
     chain = close_chain(loop.plant, pose, still)
     reference = Reference(chain.rho, chain.rho_rate, still, still)
     open_loop = structure._replace(feedback="none")
 
-    def derivative(force: Array, wrench: Array) -> Array:
-        wrench = wrench + jnp.einsum("is,isp->p", force, to_pose)
+    def derivative(load: Array) -> Array:
+        wrench, force = load[:n], jnp.reshape(load[n:], zero.shape)
         if structure.has_wrench:
             wrench = wrench + case.load.wrench
         at = PlantState(pose, still, zero, zero)
         rates = plant_rates(open_loop, pushed, at, reference._replace(wrench=wrench), force)
         return flatten(PlantState(still, rates.acceleration.pose, zero, rates.acceleration.modal))
 
-    forces = jnp.zeros((structure.n_links, count), pose.dtype)
-    by_force, by_wrench = jax.jacfwd(derivative, (0, 1))(forces, still)
-    return jnp.reshape(by_force, (-1, forces.size)), by_wrench
+    by_load = jax.jacfwd(derivative)(rates)
+    bent = jnp.swapaxes(loop.deflection_at, 1, 2)  # (3, R, S)
+    own = jnp.pad(jax.scipy.linalg.block_diag(*bent), ((n, 0), (0, 0)))
+    return by_load @ (jnp.reshape(across, (-1, n + zero.size)).T + own), by_load
 
 
 def held_modes(structure: Structure, case: Case) -> tuple[Array, Array]:

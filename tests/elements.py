@@ -110,8 +110,8 @@ def _along(model, machine, signal):
     return row
 
 
-def plant_of_elements(modes):
-    """Linear plant of finite elements for a loop with 12 modes a link.
+def plant_of_elements(modes, coordinates=39):
+    """Linear plant of finite elements for a loop with 12 modes a link, 42 if links lengthen.
 
     It has as many of their modes as such a plant, and the static rest of the others.
 
@@ -120,7 +120,7 @@ def plant_of_elements(modes):
             damping D (n, n), forces by voltages B (n, 3 K) and by slider forces F (n, 3), sensor
             voltages S (3 K, n), chord deflections W (3 S, n), and what others add, res and wres.
     """
-    n, unit = 39, np.sqrt(0.0055)  # scaled to move as modal coordinates do
+    n, unit = coordinates, np.sqrt(0.0055)  # scaled to move as modal coordinates do
     kept, rest = slice(n), slice(n, None)
     static = modes["B"][rest] / modes["w2"][rest, None]
     order = np.r_[0:3, n : n + 3, 3:n, n + 3 : 2 * n]  # of (X, X', q, q')

@@ -96,8 +96,10 @@ def tip_deflection(basis: ModalBasis, q: jax.Array) -> Any:
 
 
 def chord_length(machine: Machine, basis: ModalBasis, q: jax.Array) -> Any:
-    """c = L - 1/2 q^t S q [m], (3,): a bent link's ends are closer."""
+    """c = L - 1/2 q^t S q + e [m], (3,): a bent link's ends are closer."""
     length = jnp.broadcast_to(machine.beam.length, (len(q),))
+    if basis.stretch is not None:
+        length = length + basis.stretch * q[:, -1]
     if basis.shortening is None:
         return length
     slopes = jax.vmap(jnp.diag)(jnp.asarray(basis.shortening))
@@ -111,7 +113,10 @@ def first_moment(machine: Machine, basis: ModalBasis, q: jax.Array) -> Any:
     if basis.inward is None:
         length = jnp.broadcast_to(machine.beam.length, (len(q),))
         return basis.first_moment / length * chord_length(machine, basis, q)
-    return basis.first_moment - jnp.einsum("ij,ijk,ik->i", q, basis.inward, q) / 2
+    moment = basis.first_moment - jnp.einsum("ij,ijk,ik->i", q, basis.inward, q) / 2
+    if basis.stretch is None:
+        return moment
+    return moment + basis.first_moment / machine.beam.length * basis.stretch * q[:, -1]
 
 
 def moment_of_inertia(basis: ModalBasis, q: jax.Array) -> Any:

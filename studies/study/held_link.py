@@ -74,6 +74,8 @@ def _line(study: Study, i: int, with_patches: bool) -> tuple[np.ndarray, np.ndar
             inside = np.clip((half - np.abs(x - center)) / x[1] + 0.5, 0, 1)
             cover += inside
     below, above = faces.values()
+    if patches.actuators == "both faces":
+        below = above
     thickness, width = of(link, "thickness"), of(link, "width")
     piezo, piezo_width = of(patches, "thickness"), of(patches, "width")
     ceramic = of(patches, "density") * piezo_width * piezo

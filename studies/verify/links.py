@@ -34,13 +34,15 @@ class Segment(NamedTuple):
     actuators: tuple[int, ...]
     line_mass: float  # [kg/m]
     stiffness: float  # E I about the neutral axis of its layers [N m2]
+    axial: float  # E A of its layers [N]
+    axis: float  # that axis, from the link's mid-plane towards the actuators [m]
 
 
 def check_links(study: Study) -> list[Assumption]:
     """Frequencies, integrals of shapes, piezo constants and statics of the study's links."""
     structure, case, (loop, *_) = prepared(study)
     kind = structure.basis
-    integrals, signals, statics = [], [], []
+    integrals, signals, statics, axial = [], [], [], []
     for i in range(structure.n_links):
         beam, patches = _one(case.machine.beam, i), _one(case.machine.patches, i)
         beam = beam._replace(length=float(beam.length))
@@ -53,8 +55,13 @@ def check_links(study: Study) -> list[Assumption]:
         integrals.append(_integrals(basis, beam, shape[: x.size], slope[: x.size], x, line))
         beside = slope[x.size :].reshape(2, 2, -1, structure.n_modes)
         constants = _constants(beam, patches)
-        signals.append(_signals(loop, i, constants, beside[:, 1] - beside[:, 0], basis))
-        statics.append(_statics(loop, i, constants, sections))
+        bends = beside[:, 1] - beside[:, 0]
+        gain = _opposite_gain(patches, sections, constants) if structure.has_stretch else 0.0
+        signals.append(_signals(loop, i, constants, bends, basis, gain))
+        layers = _Layers(sections, constants, *_membrane(beam, patches, constants))
+        statics.append(_statics(loop, i, layers, gain))
+        if structure.has_stretch:
+            axial.append(_elongation(loop, i, layers))
     return [
         _frequencies(study, loop, case),
         Assumption(
@@ -78,6 +85,14 @@ def check_links(study: Study) -> list[Assumption]:
             difference=worst(*statics),
             allowed=1e-9,
             left_out="" if study.link.static_correction else "link.static_correction is off",
+        ),
+        Assumption(
+            assumption="elongation of the links: stiffness, inertia, patches' forces and volts",
+            against="sections in series, layer by layer",
+            source="Timoshenko and Gere 1961",
+            difference=worst(*axial) if axial else 0.0,
+            allowed=1e-9,
+            left_out="" if axial else "link.stretch is off",
         ),
     ]
 
@@ -152,7 +167,9 @@ def _sections(beam: Beam, patches: Patches, has_patches: bool) -> list[Segment]:
     cuts = np.unique(np.concatenate([[0.0, beam.length], *sensor, *actuator]).round(12))
     mass = float(beam.density * beam.width * beam.thickness)
     ceramic = float(patches.density * patches.width * patches.thickness) * has_patches
-    found = []
+    core = float(beam.youngs_modulus * beam.width * beam.thickness)
+    skin = float(patches.youngs_modulus * patches.width * patches.thickness)
+    arm, found = float(beam.thickness + patches.thickness) / 2, []
     for left, right in pairwise(map(float, cuts)):
         middle = (left + right) / 2
         over = [
@@ -160,8 +177,9 @@ def _sections(beam: Beam, patches: Patches, has_patches: bool) -> list[Segment]:
             for ends in (sensor, actuator)
         ]
         ceramics = 0 if patches.is_gauge else len(over[0])
-        count = ceramics, len(over[1])
-        bending = _stiffness(beam, patches, count if has_patches else (0, 0))
+        count = len(over[1]) if patches.is_paired else ceramics, len(over[1])
+        layers = count if has_patches else (0, 0)
+        axial = (core + skin * sum(layers)) * float(beam.stiffness_factor)
         line_mass = mass + ceramic * sum(count)
         found.append(
             Segment(
@@ -170,7 +188,9 @@ def _sections(beam: Beam, patches: Patches, has_patches: bool) -> list[Segment]:
                 sensors=over[0],
                 actuators=over[1],
                 line_mass=line_mass,
-                stiffness=bending,
+                stiffness=_stiffness(beam, patches, layers),
+                axial=axial,
+                axis=skin * arm * (layers[1] - layers[0]) / (core + skin * sum(layers)),
             )
         )
     return found
@@ -262,9 +282,9 @@ def _constants(beam: Beam, patches: Patches) -> tuple[float, float]:
     skin = stiff * width * piezo
     axis = skin * arm / (skin + core * float(beam.width) * thick)
     per_field = stiff * abs(float(patches.d31)) / piezo  # stress per volt [Pa/V]
-    actuator = per_field * width * piezo * (arm - axis)
+    actuator = per_field * width * piezo * (2 * arm if patches.is_paired else arm - axis)
     if patches.is_gauge:  # strain of the bare face, by a bridge and its amplifier
-        strain = (thick / 2 + axis) / float(patches.sensor_length)
+        strain = _sensor_arm(beam, patches) / float(patches.sensor_length)
         return actuator, float(patches.bridge * patches.gauge_factor) * strain
     # under a sensor both faces are covered, so the neutral axis is the link's middle
     coupling = float(patches.d31) ** 2 * stiff
@@ -274,27 +294,101 @@ def _constants(beam: Beam, patches: Patches) -> tuple[float, float]:
     return actuator, charge / capacitance
 
 
+def _sensor_arm(beam: Beam, patches: Patches) -> float:
+    """Distance of a sensor's strain from the neutral axis [m]."""
+    thick, piezo = float(beam.thickness), float(patches.thickness)
+    if not patches.is_gauge:
+        return (thick + piezo) / 2
+    skin = float(patches.youngs_modulus * patches.width) * piezo
+    core = float(beam.youngs_modulus * beam.width) * thick
+    return thick / 2 + (0 if patches.is_paired else skin * (thick + piezo) / 2 / (skin + core))
+
+
+class _Layers(NamedTuple):
+    """A link and its patches, by layers."""
+
+    sections: list[Segment]
+    constants: tuple[float, float]  # of `_constants`
+    force: float  # an actuator's push along the link [N/V]
+    membrane: float  # volts per elongation of a sensor's span [V/m]
+
+
+def _membrane(beam: Beam, patches: Patches, constants: tuple[float, float]) -> tuple[float, float]:
+    """Push [N/V] of an actuator, none of a pair, and volts per elongation [V/m]."""
+    strained = float(patches.youngs_modulus) * abs(float(patches.d31)) * float(patches.width)
+    return strained * (1 - float(patches.is_paired)), -constants[1] / _sensor_arm(beam, patches)
+
+
+def _opposite_gain(
+    patches: Patches, sections: list[Segment], constants: tuple[float, float]
+) -> float:
+    """Share by which an actuator's moment is larger under its sensor [1]."""
+    if patches.is_paired:
+        return 0.0
+    push = float(patches.youngs_modulus * patches.width) * abs(float(patches.d31))
+    axes = [s.axis for s in sections if s.sensors and s.actuators]
+    alone = [s.axis for s in sections if s.actuators and not s.sensors]
+    if not axes or not alone or not any(alone):  # bare links: the same moment everywhere
+        return 0.0
+    return push * (alone[0] - axes[0]) / constants[0]
+
+
 def _signals(
-    loop: Loop, i: int, constants: tuple[float, float], bends: np.ndarray, basis: ModalBasis
+    loop: Loop,
+    i: int,
+    constants: tuple[float, float],
+    bends: np.ndarray,
+    basis: ModalBasis,
+    gain: float,
 ) -> float:
     """What the loop's sensors see and its actuators do, against constants times slopes."""
     actuator, sensor = constants
-    sees = largest(loop.sensor[i], sensor * bends[0])
-    does = largest(loop.actuator[i].T, actuator * bends[1] / basis.mass[0])
+    modes = basis.mass.shape[1]
+    sees = largest(loop.sensor[i][:, :modes], sensor * bends[0])
+    pushes = bends[1] + gain * bends[0]
+    does = largest(loop.actuator[i][:modes].T, actuator * pushes / basis.mass[0])
     return worst(sees, does)
 
 
-def _statics(loop: Loop, i: int, constants: tuple[float, float], sections: list[Segment]) -> float:
-    """Held voltages: sensors by all modes, against moments integrated over the link."""
+def _statics(loop: Loop, i: int, layers: _Layers, gain: float) -> float:
+    """Held voltages: sensors by all modes, against moments integrated over the link.
+
+    Links that lengthen are free of tension.
+    """
     if loop.left_out is None:
         return 0.0
-    actuator, sensor = constants
+    actuator, sensor = layers.constants
     wanted = np.zeros_like(loop.left_out.sensor[i])
-    for section in sections:
-        flexibility = (section.right - section.left) / section.stiffness
+    for section in layers.sections:
+        width = section.right - section.left
         for k in section.sensors:
             for m in section.actuators:
-                wanted[k, m] += sensor * actuator * flexibility
+                wanted[k, m] += sensor * actuator * (1 + gain) * width / section.stiffness
+                if loop.plant.stretch is not None:
+                    wanted[k, m] += layers.membrane * layers.force * width / section.axial
     stiffness = loop.plant.stiffness[i] / loop.plant.modal_mass[i]
     modal = (loop.sensor[i] / stiffness) @ loop.actuator[i]
     return largest(modal + loop.left_out.sensor[i], wanted)
+
+
+def _elongation(loop: Loop, i: int, layers: _Layers) -> float:
+    """Stiffness, inertia, forces and volts of a link's elongation, section by section."""
+    assert loop.plant.stretch is not None
+    sections, scale = layers.sections, float(loop.plant.stretch[i])
+    soft = np.array([(s.right - s.left) / s.axial for s in sections])
+    ends = np.append(0.0, np.cumsum(soft)) / soft.sum()
+    squares = (ends[1:] ** 2 + ends[1:] * ends[:-1] + ends[:-1] ** 2) / 3
+    mass = np.sum([s.line_mass * (s.right - s.left) for s in sections] * squares)
+    count = loop.sensor.shape[1]
+    over = np.zeros((2, count, len(sections)))
+    for n, section in enumerate(sections):
+        over[0, list(section.sensors), n] = over[1, list(section.actuators), n] = 1.0
+    seen, pushed = over @ soft / soft.sum()
+    own = float(loop.plant.modal_mass[i])
+    return worst(
+        largest(loop.plant.stiffness[i, -1] / scale**2, 1 / soft.sum()),
+        largest(own / scale**2, mass),
+        largest(loop.sensor[i, :, -1] / scale, layers.membrane * seen),
+        np.abs(loop.actuator[i, -1] * own / scale - layers.force * pushed).max()
+        / max(layers.force, 1e-9),
+    )

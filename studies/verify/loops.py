@@ -121,7 +121,8 @@ def _release(study: Study) -> Assumption:
         np.asarray, _linear(structure._replace(n_steps=1, substeps=1), run.case)
     )
     transition = matrices.open + matrices.feedback
-    first, modes = 2 * structure.n_pose, structure.n_links * structure.n_modes
+    first, count = 2 * structure.n_pose, structure.n_coordinates
+    modes = structure.n_links * count
     if np.abs(np.linalg.eigvals(transition)).max() > 1 + _GROWTH:
         return _left_out(_NAMES[1], "the loop is unstable: the run ends at limits, not its powers")
     state = np.zeros(len(transition))
@@ -133,7 +134,8 @@ def _release(study: Study) -> Assumption:
     for _ in range(_RELEASED - 1):
         states.append(transition @ states[-1])
     wanted = np.array(states)[:, first : first + modes]
-    found = np.asarray(record.modal_coordinate).reshape(_RELEASED, modes)
+    wanted = wanted.reshape(_RELEASED, structure.n_links, count)[..., : structure.n_modes]
+    found = np.asarray(record.modal_coordinate)
     return Assumption(
         assumption=_NAMES[1],
         against=f"powers of the transition matrix, {_RELEASED} samples after a release",

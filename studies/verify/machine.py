@@ -13,7 +13,8 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.kinematics import link_direction, path_status
 from jaxmodel.loop import Loop
 from jaxmodel.parameters import Machine
-from jaxmodel.plant import Plant, build_plant
+from jaxmodel.plant import Plant, build_plant, lengthening
+from jaxmodel.prepare import stretch_of
 from studies.engine.programs import kept_jit
 from studies.reference.lagrangian import (
     Loads,
@@ -38,9 +39,14 @@ def check_machine(study: Study) -> list[Assumption]:
 
 
 @kept_jit(static_argnums=(0, 1))
-def _plant(has_shortening: bool, is_distributed: bool, machine: Machine, basis: ModalBasis) -> Any:
-    """A machine without structural damping."""
-    return build_plant(_undamped(machine), basis, False, has_shortening, is_distributed)
+def _plant(
+    structure: Structure, is_distributed: bool, case: Case, basis: ModalBasis
+) -> tuple[Plant, ModalBasis]:
+    """A machine without structural damping, and the basis of all its coordinates."""
+    machine, shortening = _undamped(case.machine), structure.has_shortening
+    stretch = stretch_of(structure, case._replace(machine=machine))
+    plant = build_plant(machine, basis, False, shortening, is_distributed, stretch)
+    return plant, basis if stretch is None else lengthening(basis, stretch)
 
 
 def _undamped(machine: Machine) -> Machine:
@@ -60,9 +66,8 @@ def _accelerations(
     apart, open_by = {}, []
     for name, is_distributed in forms.items():
         basis = whole if is_distributed else whole._replace(inward=None, centrifugal=None)
-        built = _plant(structure.has_shortening, is_distributed, case.machine, basis)
-        plant = jax.tree.map(np.asarray, built)
-        states = _random_states(study, plant, structure.n_modes)
+        plant, basis = jax.tree.map(np.asarray, _plant(structure, is_distributed, case, basis))
+        states = _random_states(study, plant, structure)
         found, wanted, gaps = map(np.asarray, _both(case.machine, basis, plant, states))
         parts = slice(structure.n_pose), slice(structure.n_pose, None)
         pairs = [(row[p], true[p]) for row, true in zip(found, wanted, strict=True) for p in parts]
@@ -90,7 +95,7 @@ def _accelerations(
     return [*rows, closure]
 
 
-def _random_states(study: Study, plant: Plant, n_modes: int) -> tuple[RigidState, Loads]:
+def _random_states(study: Study, plant: Plant, structure: Structure) -> tuple[RigidState, Loads]:
     rng = np.random.default_rng(7)
     length = float(np.min(study.link.length))
     points = np.array(study.motion.waypoints, float)
@@ -104,7 +109,10 @@ def _random_states(study: Study, plant: Plant, n_modes: int) -> tuple[RigidState
         if len(poses) == _STATES:
             break
         scale = scale * 0.98  # way-points may lie at the edge of what is in reach
-    count, order = len(poses), np.arange(1, n_modes + 1)
+    # an elongation counts as a mode too high to move it far
+    count, order = len(poses), np.arange(1, structure.n_modes + 1)
+    n_modes = structure.n_coordinates
+    order = np.append(order, [10.0] * structure.has_stretch)
     motion = RigidState(
         pose=np.array(poses),
         pose_rate=rng.normal(size=(count, pose_size)) * [0.3, 0.3, 1.0][:pose_size],
@@ -148,11 +156,13 @@ def _damping(case: Case, loop: Loop) -> Assumption:
             last = min(j, count - 1)
             share = loop.omega[i, j] / loop.omega[i, last]
             wanted[i, j] = ratio[i, last] * share**exponent
-    critical = 2 * np.sqrt(loop.plant.stiffness * loop.plant.modal_mass[:, None])
+    count = wanted.shape[1]
+    plant = loop.plant
+    critical = 2 * np.sqrt(plant.stiffness[:, :count] * plant.modal_mass[:, None])
     return Assumption(
         assumption="structural damping of the links' modes",
         against="damping over twice the square root of stiffness and mass",
         source="Rayleigh 1877",
-        difference=largest(loop.plant.damping / critical, wanted),
+        difference=largest(plant.damping[:, :count] / critical, wanted),
         allowed=1e-9,
     )

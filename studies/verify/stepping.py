@@ -17,8 +17,7 @@ from jaxmodel.integrator import exponential_step
 from jaxmodel.kinematics import inverse_kinematics
 from jaxmodel.loop import Loop, PlantState, plant_step
 from jaxmodel.motion import end_of_path, sample_path
-from jaxmodel.plant import damping_ratio
-from jaxmodel.prepare import prepare
+from jaxmodel.prepare import oscillators, prepare
 from studies.engine.executor import Executor
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.preflight import check_run
@@ -77,8 +76,8 @@ def _step(
     has_force = DRIVES[structure.drive].has_feedforward or structure.has_wrench
     period = case.electronics.period
     step = period / parts
-    zeta = damping_ratio(case.machine.damping, loop.omega)
-    exponential = exponential_step(loop.omega, zeta, step, case.electronics.antialias)
+    omega, zeta, _ = oscillators(structure, case, loop.plant, loop.omega)
+    exponential = exponential_step(omega, zeta, step, case.electronics.antialias)
     loop = loop._replace(plant_step=step, exponential=exponential)
 
     def wanted(time: Any) -> Reference:
@@ -112,7 +111,7 @@ def _step(
 
 
 def _at_rest(structure: Structure, case: Case, q: np.ndarray) -> PlantState:
-    zero = np.zeros((structure.n_links, structure.n_modes))
+    zero = np.zeros((structure.n_links, structure.n_coordinates))
     bent = zero.copy()
     bent[:, 0] = q
     pose = np.asarray(case.path.waypoints[0], float)
@@ -124,6 +123,7 @@ def _energy(study: Study) -> Assumption:
     """The machine without drive, friction, load and damping, bent and let go."""
     free = study.change(
         link__damping_ratio=0.0,
+        link__stretch_damping=0.0,
         link__modes=min(study.link.modes, 3),
         drive__kp=0.0,
         drive__kd=0.0,

@@ -1,0 +1,214 @@
+"""Patches as they are: they stiffen links and lengthen them, against two independent codes."""
+
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmodel import sampled_loop
+from jaxmodel.frequency_response import IMAGES, image_weights, plant_images, plant_response
+from jaxmodel.prepare import prepare
+from jaxmodel.sampled_loop import closed_loop, sampled_plant
+from jaxmodel.stretch import find_stretch, held_voltage
+from studies.engine.margins import judge_loops
+from studies.engine.stability import gain_margin, loop_report, with_margin_modes
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.spec import parse_study
+from tests import DATA
+from tests.elements import plant_of_elements
+
+#: Gain margin and frequency of breaking by finite elements and by Exudyn, and damping of mode 1:
+#: of the controller with the paper's basis and half the paper's gains (model.md of the order, 4d).
+PUBLISHED = {
+    ("pinned_pinned", False, 0.01): (3.699, 1199, 3.705, None),
+    ("pinned_pinned", True, 0.01): (1.677, 1248, 1.601, None),
+    ("pinned_pinned", True, 0.03): (2.190, 1279, 2.038, None),
+    ("loaded", False, 0.01): (5.175, 1197, 5.175, (0.1284, 0.1397, 0.1436)),
+    ("loaded", True, 0.01): (1.899, 1266, None, (0.1376, 0.1527, 0.1570)),
+    ("loaded", True, 0.03): (2.581, 1296, None, (0.1376, 0.1527, 0.1570)),
+}
+CONTROL = {"basis": "pinned_pinned", "velocity_gain": [1.55, 1.75, 1.7]}
+
+
+def study_of(basis="loaded", stretch=True, damping=0.01, kind="prrr", control=CONTROL, **link):
+    link = {"basis": basis, "stretch": stretch, "stretch_damping": damping, **link}
+    control = dict(control)
+    if kind == "five_bar":
+        control["velocity_gain"] = control["velocity_gain"][:2]
+    return parse_study({"machine": {"kind": kind}, "link": link, "control": control})
+
+
+@cache
+def report_of(*arguments):
+    study = study_of(*arguments)
+    pose = np.array(study.motion.waypoints[0])
+    return loop_report(build_structure(study), build_case(study), pose)
+
+
+@pytest.mark.parametrize("machine", PUBLISHED)
+def test_margins_and_damping_are_those_of_two_independent_codes(machine):
+    margin, frequency, other, damping = PUBLISHED[machine]
+    report = report_of(*machine)
+    bending = not machine[1]
+    np.testing.assert_allclose(report.gain_margin, margin, rtol=1e-3 if bending else 0.03)
+    np.testing.assert_allclose(report.breaking_frequency, frequency, rtol=1e-3)
+    if other is not None:
+        np.testing.assert_allclose(report.gain_margin, other, rtol=0.08)
+    if damping is not None:
+        np.testing.assert_allclose(report.damping_ratio[0], damping, rtol=0.01)
+    assert report.breaking.startswith("stretch of links") != bending
+
+
+@pytest.mark.parametrize("kind", ["prrr", "rrr", "five_bar"])
+def test_batches_judge_loops_as_eigenvalues_do(kind):
+    study = study_of(kind=kind)
+    structure, case = build_structure(study), build_case(study)
+    wanted = loop_report(structure, case, np.array(study.motion.waypoints[0]))
+    batch = judge_loops(structure, jax.tree.map(lambda x: np.asarray(x)[None], case))
+    np.testing.assert_allclose(batch.gain_margin, wanted.gain_margin, rtol=1e-3)
+    np.testing.assert_allclose(batch.least_damping[0], wanted.damping_ratio.min(axis=1), rtol=1e-3)
+
+
+def finite_elements():
+    """A machine as it is by an independent code: E 68.3e9 Pa, payload 0.12 kg, damping 0.012."""
+    with np.load(DATA / "as_it_is_plant.npz") as given:
+        modes = dict(given)
+    none = {"F": np.zeros((78, 3)), "W": np.zeros((9, 78)), "wres": np.zeros((9, 9))}
+    return modes, plant_of_elements({**modes, **none}, coordinates=42)
+
+
+@partial(jax.jit, static_argnums=0)
+def around_finite_elements(structure, case):
+    return closed_loop(structure, case, case.path.waypoints[0])
+
+
+def test_a_controller_around_finite_elements_has_its_published_margin(monkeypatch):
+    modes, plant = finite_elements()
+    study = study_of(modes=12)
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    monkeypatch.setattr(sampled_loop, "linearise", lambda *_: plant)
+    matrices = jax.tree.map(np.asarray, around_finite_elements(structure, case))
+    margin = gain_margin(
+        lambda factor: np.linalg.eigvals(matrices.open + factor * matrices.feedback)
+    )
+    np.testing.assert_allclose(margin, 3.664, rtol=1e-3)
+    poles = np.log(np.linalg.eigvals(matrices.open + matrices.feedback)) * 1e4
+    mode_1 = poles[(np.abs(np.abs(poles) / (2 * np.pi) - 113.8) < 0.5) & (poles.imag > 0)]
+    np.testing.assert_allclose(
+        np.sort(-mode_1.real / np.abs(mode_1)), [0.1392, 0.1544, 0.1586], atol=1e-4
+    )
+    # and our plant of that machine, under the same controller
+    mine = study_of(modes=12, youngs_modulus=68.3e9, damping_ratio=0.012)
+    mine = mine.change(load__mass=0.12)
+    law = prepare(structure, case).loop.controller
+    found = loop_report(
+        build_structure(mine), build_case(mine), np.array(mine.motion.waypoints[0]), law=law
+    )
+    np.testing.assert_allclose(found.gain_margin, margin, rtol=0.03)
+    # static volts per volt, all patches
+    static = modes["S"] @ (modes["B"] / modes["w2"][:, None]) + modes["res"]
+    case = as_arrays(build_case(mine))
+    np.testing.assert_allclose(static_volts(mine, case), static, atol=1e-3 * static[0, 0])
+
+
+def static_volts(study, case):
+    """Sensor volts per held actuator volt of the machine, all modes, (9, 9)."""
+    plant = sampled_plant(build_structure(study), case, case.path.waypoints[0])
+    eye = np.eye(len(plant.state))
+    return np.asarray(plant.leave @ np.linalg.solve(eye - plant.state, plant.enter))
+
+
+#: By plane-stress elasticity of a link with its patches (model.md of the order, 4d).
+ELASTICITY = 0.0189
+
+
+@pytest.mark.parametrize(
+    ("basis", "stretch", "rounded"),
+    [
+        ("pinned_pinned", False, 0.05007),
+        ("pinned_pinned", True, 0.0350),
+        ("loaded", False, 0.0297),
+        ("loaded", True, 0.0198),
+    ],
+)
+def test_static_volts_per_volt_are_a_closed_form(basis, stretch, rounded):
+    """lambda_s F l (arm/EI - 1/(z_s EA)) of a pair on its own sensor, from first principles."""
+    study = study_of(basis, stretch)
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    beam, patches = study.link, study.patches
+    layers, height = 2 * (basis == "loaded"), (beam.thickness + patches.thickness) / 2
+    skin = patches.youngs_modulus * patches.width * patches.thickness
+    core = beam.youngs_modulus * beam.width * beam.thickness
+    shift = skin * height / (skin + core)
+    arm = height if stretch and layers else height - shift
+    bending = core * beam.thickness**2 / 12 + layers * skin * (
+        height**2 + patches.thickness**2 / 12
+    )
+    push = patches.width * patches.youngs_modulus * abs(patches.d31)
+    permittivity = 8.8541878128e-12 * patches.relative_permittivity
+    permittivity -= patches.d31**2 * patches.youngs_modulus
+    charge = push * patches.thickness / (permittivity * patches.width)
+    wanted = charge * push * (height * arm / bending - stretch / (core + layers * skin))
+    loop = jax.jit(prepare, static_argnums=0)(structure, case).loop
+    stiffness = loop.plant.stiffness / loop.plant.modal_mass[:, None]
+    modal = jnp.einsum("ikr,irl->ikl", loop.sensor / stiffness[:, None], loop.actuator)
+    found = np.asarray(modal + loop.left_out.sensor)
+    np.testing.assert_allclose(found, wanted * np.eye(3) * np.ones((3, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(wanted, rounded, rtol=3e-3)
+    if stretch and layers:
+        np.testing.assert_allclose(wanted, ELASTICITY, rtol=0.06)
+
+
+@pytest.mark.parametrize("kind", ["prrr", "rrr", "five_bar"])
+def test_responses_in_closed_form_are_those_of_the_sampled_plant(kind):
+    study = study_of(kind=kind)
+    structure, case = with_margin_modes(build_structure(study), build_case(study), 8)
+    case = as_arrays(case)
+
+    @jax.jit
+    def both(case, omega):
+        pose = case.path.waypoints[0]
+        plant = sampled_plant(structure, case, pose)
+        response = plant_response(structure, case, prepare(structure, case).loop, pose)
+        z = jnp.exp(1j * omega * response.period)
+        eye = jnp.eye(len(plant.state))
+        wanted = plant.leave @ jnp.linalg.solve(z * eye - plant.state, plant.enter + 0j)
+        images = plant_images(response, omega, np.arange(-IMAGES, IMAGES + 1)).sensed
+        weights = image_weights(response.late) * z**-response.late
+        return wanted, jnp.einsum("n,nab->ab", weights, images)
+
+    for hertz in (20.0, 460.0, 1180.0, 2450.0):
+        wanted, found = both(case, 2 * np.pi * hertz)
+        np.testing.assert_allclose(found, wanted, atol=1e-7 * np.abs(wanted).max())
+
+
+def test_pairs_of_actuators_on_both_faces_do_not_lengthen_links():
+    one, both = study_of(), study_of().change(patches__actuators="both faces")
+    stretch, paired = (
+        find_stretch(case.machine.beam, case.machine.patches, case.machine.damping, True)
+        for case in (build_case(one), build_case(both))
+    )
+    assert np.all(np.asarray(stretch.free) > 0) and not np.any(paired.free)
+    assert not np.any(held_voltage(paired)) and np.any(held_voltage(stretch))
+    margins = [report_of().gain_margin]
+    margins.append(
+        loop_report(
+            build_structure(both), build_case(both), np.array(both.motion.waypoints[0])
+        ).gain_margin
+    )
+    assert margins[1] > 1.3 * margins[0]
+
+
+@pytest.mark.parametrize(("law", "published"), [("lqg", 13.1), ("observer", 9.9)])
+def test_laws_with_a_model_keep_their_margins(law, published):
+    """Published: of laws that believe that links keep their length."""
+    study = study_of(control={"basis": "pinned_pinned", "law": law})
+    structure, case = build_structure(study), build_case(study)
+    pose = np.array(study.motion.waypoints[0])
+    ignorant = as_arrays(build_case(study.change(link__stretch=False)))
+    believed = prepare(structure._replace(has_stretch=False), ignorant).loop.controller
+    report = loop_report(structure, case, pose, law=believed)
+    np.testing.assert_allclose(report.gain_margin, published, rtol=5e-3)
+    assert loop_report(structure, case, pose).gain_margin > 0.9 * published
