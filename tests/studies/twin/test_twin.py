@@ -557,6 +557,19 @@ def test_gain_margins_of_links_that_lengthen_are_the_same_in_both_models(basis):
     assert predicted < 0.6 * margin_of(study.change(link__stretch=False))
 
 
+@pytest.mark.long
+def test_a_move_of_links_that_lengthen_is_the_same_and_wrong_patches_are_noticed():
+    needs_exudyn()
+    study = Study().change(**SHORT, link__stretch=True, run__substeps=4)
+    found = differences(study, Settings())
+    assert np.all(found < [2e-3, 2e-3, 5e-3]), found
+    machine = compare.TwinBench(study).machine
+    for fault in ({"membrane": -machine.links[0].membrane}, {"push": 0.0}):
+        links = tuple(link._replace(**fault) for link in machine.links)
+        wrong = differences(study, Settings(), machine._replace(links=links))
+        assert np.all(wrong[1:] > 0.02), fault
+
+
 def margin_of(study):
     """By the linearised loop of the model."""
     waypoint = np.asarray(study.motion.waypoints[0])
