@@ -92,14 +92,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
     bases = find_bases(structure, case)
     basis = bases.plant
     stretch = stretch_of(structure, case)
-    plant = build_plant(
-        machine,
-        basis,
-        case.drive.is_locked,
-        structure.has_shortening,
-        structure.is_distributed,
-        stretch,
-    )
+    plant = _plant(structure, case, basis)
     design = design_controller(structure, case, bases)
     omega = jnp.sqrt(basis.stiffness / basis.mass)
     split = oscillators(structure, case, plant, omega)
@@ -166,6 +159,17 @@ def _beside(x: Array, value: Array, axis: int) -> Array:
     shape = (*x.shape[:axis], 1, *x.shape[axis + 1 :])
     last = jnp.expand_dims(value, axis) if jnp.ndim(value) else jnp.full(shape, value)
     return jnp.concatenate([x, last], axis=axis)
+
+
+def _plant(structure: Structure, case: Case, basis: ModalBasis) -> Plant:
+    return build_plant(
+        case.machine,
+        basis,
+        case.drive.is_locked,
+        structure.has_shortening,
+        structure.is_distributed,
+        stretch_of(structure, case),
+    )
 
 
 def stretch_of(structure: Structure, case: Case) -> Stretch | None:
@@ -537,10 +541,17 @@ def drive_rate(kind: str, case: Case) -> Array:
 
 
 def coupled_rate(structure: Structure, case: Case) -> Array:
-    """omega of the highest mode of links whose ends are not on their chords [rad/s], 0: they are.
+    """omega of the fastest motion that `COUPLED_STEP_LIMIT` bounds [rad/s], 0: there is none.
 
-    Of pinned-free links, sqrt(E I/(rhoA L^4)) (kL)^2.
+    The highest mode of links whose ends are not on their chords, of pinned-free links
+    sqrt(E I/(rhoA L^4)) (kL)^2; or a share of the fastest longitudinal mode, whose limit is
+    `STIFFNESS_LIMIT`.
     """
+    if structure.has_stretch:
+        plant = _plant(structure, case, find_bases(structure, case).plant)
+        modes = jnp.sqrt(plant.stiffness / plant.modal_mass[:, None])[:, :-1]
+        omega = oscillators(structure, case, plant, modes)[0][:, -1]
+        return STRETCHING * jnp.max(omega) * (COUPLED_STEP_LIMIT / STIFFNESS_LIMIT)
     if BASES[structure.basis].is_on_chord:
         return jnp.zeros(())
     beam = case.machine.beam

@@ -17,7 +17,7 @@ from studies.show import figures
 from studies.show.pages import inline_image, render
 from studies.show.units import count_text
 from studies.study.labels import describe
-from studies.study.margin import LEFT_OUT, margin_in_db, margin_text
+from studies.study.margin import margin_in_db, margin_text, stretch_text
 
 #: Rows of a table, and width [inch] and resolution [1/inch] of a picture.
 MOST, WIDTH, DPI = 6, 5.6, 90
@@ -61,7 +61,7 @@ def _run(run: Any) -> Card:
     loop = run.loop
     lines = [f"Status: {describe(run.status)}.", limits_text(run)]
     if loop is not None:
-        lines += [f"Gain margin {margin_in_db(loop.gain_margin)}.", LEFT_OUT]
+        lines += [f"Gain margin {margin_in_db(loop.gain_margin)}.", stretch_text(loop.by_stretch)]
     figure = None
     if run.result.record is not None:
         figure, ax = figures.one_panel(2.2)

@@ -11,8 +11,9 @@ from __future__ import annotations
 import copy
 from typing import Any
 
-from studies.study.spec import Study, parse_study
+from studies.study.spec import Study
 from studies.study.template import toml_text
+from tests.bare import parse_study
 
 HOME = [0.0, 0.0, 0.5235987755982988]
 #: Samples of runs in tests, at 10 kHz; the default study has 8,000.

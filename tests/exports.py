@@ -8,8 +8,8 @@ import pytest
 
 from studies.engine.controller import fixed_controller
 from studies.export.compiler import find_compiler
-from studies.study.spec import paper_study, parse_study
 from studies.study.template import study_template
+from tests.bare import paper_study, parse_study
 
 _HOME = list(paper_study().motion.waypoints[0])
 _SHORT = {

@@ -4,7 +4,7 @@ import numpy as np
 
 from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES
 from jaxmodel.mechanisms.prrr.paper import HOME
-from studies.study.spec import parse_study
+from tests.bare import parse_study
 
 ANGLES = np.array([2 * np.pi / 3, 4 * np.pi / 3, 0.0])
 SIDE = 0.6

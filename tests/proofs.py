@@ -17,7 +17,7 @@ from studies.errors import StudyError
 from studies.spillover.plants import LoopBuilder, PlantVariant, pad_channels, plant_structure
 from studies.spillover.proofs import collect
 from studies.study.margin import HIGHEST
-from studies.study.spec import paper_study
+from tests.bare import paper_study
 
 ONE_MOVE = paper_study().change(link__modes=3, motion__waypoints=paper_study().motion.waypoints[:2])
 

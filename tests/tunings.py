@@ -1,7 +1,7 @@
 """A tuning of a small machine that the tests of tunings share."""
 
-from studies.study.spec import paper_study
 from studies.tuning.spec import parse_tuning
+from tests.bare import paper_study
 
 HOME = list(paper_study().motion.waypoints[0])
 SMALL = {

@@ -216,10 +216,8 @@ def _plant_steps(
     needed = np.maximum(np.ceil(rate * period / STIFFNESS_LIMIT), 1)
     written = int(table.values("run.substeps")[members[0]])
     is_too_stiff = needed > (written or SUBSTEP_LIMIT)
-    if not BASES[structure.basis].is_on_chord:
-        coupled = _of_cases(
-            table, structure, members, ("link.",), partial(_coupled_rate, structure)
-        )
+    if structure.has_stretch or not BASES[structure.basis].is_on_chord:
+        coupled = _of_cases(table, structure, members, _COUPLED, partial(_coupled_rate, structure))
         needed = np.maximum(needed, np.ceil(coupled * period / COUPLED_STEP_LIMIT))
     counts = np.full(len(members), written) if written else step_counts(needed)
     return np.where(is_too_stiff, written or 1, counts), is_too_stiff
@@ -227,6 +225,10 @@ def _plant_steps(
 
 #: Columns that `drive_rate` depends on.
 _DRIVE = ("drive.", "machine.")
+
+
+#: Columns that `coupled_rate` depends on.
+_COUPLED = ("link.", "patches.", "machine.", "load.", "motion.", "drive.locked")
 
 
 _drive_rate = kept_jit(static_argnums=0)(drive_rate)

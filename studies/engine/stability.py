@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, loop_matrices
 from studies.engine.host_loop import SampledLoop, name_motion, sampled_loop
 from studies.engine.programs import kept_jit
-from studies.study.margin import HIGHEST, LOWEST, MARGIN_MODES
+from studies.study.margin import DAMPINGS, HIGHEST, LOWEST, MARGIN_MODES
 from studies.threads import serial_blas
 
 #: Largest ratio of successive gain factors [1].
@@ -61,6 +61,8 @@ class LoopFigures(NamedTuple):
     time: Array = None  # of the frozen instants of a motion [s], (k,)
     axial_force: Array = None  # tension in the links then [N], (k, 3)
     robustness: dict[str, Array] | None = None  # of `jaxmodel.robustness`, by name, (...)
+    # gain margins at rest by the damping of longitudinal modes [1]; None: links keep their length
+    by_stretch: dict[float, float] | None = None
 
     @property
     def is_stable(self) -> bool:
@@ -241,25 +243,37 @@ def _figures(
 ) -> tuple[LoopFigures, LoopFigures | None]:
     plain, case = with_margin_modes(structure, case, n_modes)
     modes, stacked = _parts(plain, case, law)
-    loops = jax.tree.map(np.asarray, _loops(plain, has_motion, case, pose, stacked))
     period = float(case.electronics.period)
+
+    def all_loops(case: Case) -> _Loops:
+        return jax.tree.map(np.asarray, _loops(plain, has_motion, case, pose, stacked))
 
     def loop(matrices: LoopMatrices, *place: int) -> SampledLoop:
         matrices = jax.tree.map(lambda x: x[place], matrices)
         return sampled_loop(matrices, loops.omega, period, n_tracked, plain.has_stretch)
 
+    def margin(matrices: LoopMatrices, *place: int) -> float:
+        each = [loop(matrices, *place, p).poles for p in range(len(modes))]
+        return min(gain_margin(cache(poles)) for poles in each)
+
+    loops: Any = all_loops(case)
     with serial_blas():
         parts = [judge_loop(loop(loops.at_rest, p)) for p in range(len(modes))]
         figures = worst_figures(list(zip(modes, parts, strict=True)))
         if not has_motion:
             return figures, None
+        if plain.has_stretch:
+            by_stretch = {x: margin(all_loops(_stretching(case, x)).at_rest) for x in DAMPINGS}
+            figures = figures._replace(by_stretch=by_stretch)
         _, instants = np.unique(loops.time, return_index=True)
-        margins = [
-            min(gain_margin(cache(loop(loops.in_motion, k, p).poles)) for p in range(len(modes)))
-            for k in instants
-        ]
+        margins = [margin(loops.in_motion, k) for k in instants]
     time, force = loops.time[instants], loops.axial_force[instants]
     return figures, LoopFigures(np.array(margins), time=time, axial_force=force)
+
+
+def _stretching(case: Case, damping: float) -> Case:
+    own = case.machine.damping._replace(stretch=np.full_like(case.machine.damping.stretch, damping))
+    return case._replace(machine=case.machine._replace(damping=own))
 
 
 def judge_loop(loop: SampledLoop, steps: np.ndarray = STEPS) -> LoopFigures:

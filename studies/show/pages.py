@@ -27,7 +27,7 @@ from studies.publish import FAULT
 from studies.show.units import count_text, headed, number, span
 from studies.study.entries import links_text
 from studies.study.labels import describe
-from studies.study.margin import LEFT_OUT, margin_in_db, robustness_text
+from studies.study.margin import GUESSED, margin_in_db, robustness_text
 from studies.study.spec import Study
 from studies.study.template import study_template
 
@@ -106,7 +106,7 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
     )
     environment.filters.update(FILTERS)
-    environment.globals["left_out"] = LEFT_OUT
+    environment.globals["left_out"] = GUESSED
     return environment
 
 

@@ -170,12 +170,12 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
     from studies.single.summary import limits_text, link_rows
     from studies.study.labels import describe, remedy
     from studies.study.margin import (
-        LEFT_OUT,
         MARGIN_MODES,
         caution,
         hysteresis_text,
         margin_in_db,
         robustness_text,
+        stretch_text,
     )
     from studies.study.spec import AUTO
 
@@ -207,7 +207,7 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
         f"({max(MARGIN_MODES, modes)} plant modes per link, the run {modes})",
         soft_wrap=True,
     )
-    console.print(LEFT_OUT, soft_wrap=True)
+    console.print(stretch_text(run.loop.by_stretch), soft_wrap=True)
     if run.loop.robustness:
         console.print(robustness_text(run.loop.robustness), soft_wrap=True)
     if run.poles is not None:

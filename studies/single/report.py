@@ -23,7 +23,7 @@ from studies.show.sketch import CAPTION
 from studies.show.units import is_cut_off, number
 from studies.show.words import control_text, motion_text
 from studies.single.summary import limits_text, link_rows, settling_text, watched
-from studies.study.margin import ENOUGH, MARGIN_MODES, caution, hysteresis_text
+from studies.study.margin import ENOUGH, MARGIN_MODES, caution, hysteresis_text, stretch_text
 
 #: Figures, by the end of the file name.
 #: What a run means, by its situation.
@@ -88,6 +88,7 @@ def report(
         later=_settling_delay(run, free, worst) if free else "",
         verdict=VERDICTS,
         caution=caution(run.loop.gain_margin) if run.loop is not None else "",
+        by_stretch=stretch_text(run.loop.by_stretch) if run.loop is not None else "",
         at_limit=limits_text(run),
         hysteresis=hysteresis_text(study.patches.hysteresis),
         case=_situation(run, twin),

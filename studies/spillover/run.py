@@ -39,7 +39,7 @@ from studies.spillover.report import (
 )
 from studies.store import Variable, write_store
 from studies.study.labels import STATUS_LABEL
-from studies.study.margin import LEFT_OUT
+from studies.study.margin import GUESSED
 from studies.study.spec import Study
 
 DOCUMENT, DATA = "certificate.json", "spillover.h5"
@@ -104,7 +104,7 @@ def spillover_design(
             (staging / DOCUMENT).write_text(document(certificate), encoding="utf-8")
             _draw(staging, certificate, has_pdf)
             (staging / REPORT).write_text(report(certificate, staging), encoding="utf-8")
-    for note in (*certificate.notes, LEFT_OUT):
+    for note in (*certificate.notes, GUESSED):
         console.print(note, soft_wrap=True)
     announce(console, out / REPORT, ", data and figures in the same folder")
     return certificate

@@ -28,7 +28,12 @@ EachMode: TypeAlias = EachLink[Number] | tuple[()] | ListALink[Number]
 class LinkSection(Section):
     """The flexible links; dimensions and material: one number for all, or one each."""
 
-    basis: Basis = described("pinned_pinned", "-", "modal basis of the plant")
+    basis: Basis = described(
+        "loaded",
+        "-",
+        "modal basis of the plant: loaded has the patches' mass and stiffness and the joints' "
+        "inertia; pinned_pinned and pinned_free are bare links, the paper's simplification",
+    )
     modes: int = described(8, "1", "plant modes per link", ge=1, le=16)
     shortening: bool = described(
         True,
@@ -37,7 +42,7 @@ class LinkSection(Section):
         "(not in pinned_free)",
     )
     stretch: bool = described(
-        False,
+        True,
         "-",
         "links lengthen, and patches push along them; false: the paper's model (as in pinned_free)",
     )

@@ -22,10 +22,12 @@ HIGHEST, LOWEST = 64.0, 1e-6
 
 
 #: What stands beside margins and proofs.
-LEFT_OUT = (
-    "Left out of margins and proofs: a patch on one face also stretches its link. Two other codes "
-    "that have it put the default controller's margin at 1.6 to 1.9, where this program has 3.70."
+GUESSED = (
+    "Margins and proofs rest on the damping of longitudinal modes, link.stretch_damping, which is "
+    "a guess until it is measured; with link.stretch = false they leave these modes out."
 )
+#: Other dampings of longitudinal modes at which a design's margin is told [1].
+DAMPINGS = (0.003, 0.01, 0.03, 0.1)
 
 
 def caution(margin: float) -> str:
@@ -45,6 +47,14 @@ def caution(margin: float) -> str:
             f"CAUTION: a gain margin of {margin:.3g}; below {ENOUGH:g} a machine may go unstable."
         )
     return ""
+
+
+def stretch_text(margins: Mapping[float, float] | None) -> str:
+    """Gain margins by the damping of longitudinal modes, in one line."""
+    if margins is None:
+        return GUESSED
+    each = ", ".join(f"{value:.3g} at {100 * zeta:g} %" for zeta, value in margins.items())
+    return f"gain margin by the damping of longitudinal modes, link.stretch_damping: {each}"
 
 
 def hysteresis_text(width: float) -> str:

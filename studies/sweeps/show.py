@@ -30,7 +30,7 @@ from studies.errors import ResolutionWarning, StudyError, field_error
 from studies.show.listing import Rows, print_rows
 from studies.show.units import count_text, headed, readable, settling_text
 from studies.study.entries import links_text
-from studies.study.margin import ENOUGH, LEFT_OUT, margin_text
+from studies.study.margin import ENOUGH, GUESSED, margin_text
 from studies.study.resolution import is_deflection, least_step, resolution_text
 from studies.sweeps.environments import (
     design_values,
@@ -236,7 +236,7 @@ def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console:
     if note:
         console.print(note, soft_wrap=True)
     if _has_margins(data):
-        console.print(LEFT_OUT, soft_wrap=True)
+        console.print(GUESSED, soft_wrap=True)
     for warning in ranking_warnings(data, cases, metrics[0]):
         console.print(f"[bold red]{escape(warning)}[/]", soft_wrap=True, markup=True)
 

@@ -17,7 +17,7 @@ from jaxmodel.prepare import prepare
 from jaxmodel.return_difference import assembled_modes, loop_response
 from jaxmodel.simulate import simulate
 from studies.study.cases import as_arrays, build_case, build_structure
-from studies.study.spec import paper_study
+from tests.bare import paper_study
 
 #: Sizes that cannot be taken for one another: modes, channels, patches, stations.
 STUDY = paper_study().change(

@@ -24,7 +24,8 @@ from studies.errors import ModelWarning, StudyError
 from studies.reference import lagrangian as reference
 from studies.reference import tables
 from studies.study.cases import as_arrays, build_case, build_structure
-from studies.study.spec import load_study, paper_study
+from studies.study.spec import load_study
+from tests.bare import paper_study
 
 SPECS = Path(studies.__file__).parent / "specs"
 HOME_POSE = np.array(HOME)

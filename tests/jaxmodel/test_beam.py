@@ -16,7 +16,7 @@ from jaxmodel.plant import damping_ratio
 from jaxmodel.prepare import coupled_rate
 from jaxmodel.response import held_modes
 from studies.study.cases import as_arrays, build_case, build_structure
-from studies.study.spec import paper_study
+from tests.bare import paper_study
 
 MACHINE = paper_machine()
 BEAM, PATCHES = MACHINE.beam, MACHINE.patches

@@ -23,10 +23,10 @@ from studies.errors import StudyError
 from studies.spillover.certificate import certify
 from studies.spillover.plants import ModelMismatch
 from studies.study.cases import build_structure
-from studies.study.spec import paper_study, parse_study
 from studies.tuning.optimise import optimise
 from studies.tuning.run import make_evaluator
 from studies.tuning.spec import parse_tuning
+from tests.bare import paper_study, parse_study
 from tests.jaxmodel.kept import arrays, loop_at, nominal_of, plant_at, simulated
 from tests.jaxmodel.test_notch import NOTCHES
 from tests.jaxmodel.test_onset import BASE, HOME, is_growing

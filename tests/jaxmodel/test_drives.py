@@ -20,9 +20,9 @@ from studies.export.c_drive import compare_drive, drive_code
 from studies.export.compiler import find_compiler
 from studies.extensions import extend
 from studies.study.cases import build_structure
-from studies.study.spec import parse_study
 from studies.study.window import settling_time
 from studies.verify.loops import _release
+from tests.bare import parse_study
 from tests.jaxmodel.kept import arrays, loop_at, simulated
 from tests.studies.kernels.test_kernel import both, check_equal
 from tests.sweeps import small_spec

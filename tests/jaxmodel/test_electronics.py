@@ -8,7 +8,7 @@ from jaxmodel.electronics import design_amplifier, measurement_chain
 from jaxmodel.piezo import sensor_capacitance
 from studies.engine.stability import loop_report
 from studies.study.cases import as_arrays, build_case
-from studies.study.spec import paper_study
+from tests.bare import paper_study
 from tests.jaxmodel.kept import arrays, simulated
 
 HERTZ = 2 * np.pi

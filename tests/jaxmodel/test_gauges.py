@@ -12,8 +12,8 @@ from jaxmodel.simulate import simulate
 from jaxmodel.static import link_pieces, section_stiffness
 from studies.errors import StudyError
 from studies.study.cases import as_arrays, build_case
-from studies.study.spec import paper_study, parse_study
 from studies.verify.links import check_links
+from tests.bare import paper_study, parse_study
 from tests.jaxmodel import kept
 from tests.jaxmodel.kept import loop_at, plant_at, prepared
 from tests.jaxmodel.test_onset import BASE, HOME

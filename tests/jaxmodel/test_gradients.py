@@ -13,7 +13,7 @@ from jaxmodel.case import Structure
 from jaxmodel.control import pole_placement
 from jaxmodel.simulate import simulate
 from studies.study.cases import as_arrays, build_case, build_structure
-from studies.study.spec import parse_study
+from tests.bare import parse_study
 from tests.documents import blocks, page
 from tests.jaxmodel.kept import bases_of
 from tests.studies.engine.test_batch import short_study

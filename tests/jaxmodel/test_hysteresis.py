@@ -22,8 +22,8 @@ from studies.engine.run_data import chord_deflection
 from studies.engine.runs import Run
 from studies.errors import StudyError
 from studies.study.margin import hysteresis_text
-from studies.study.spec import paper_study, parse_study
 from studies.twin.compare import check_supported
+from tests.bare import paper_study, parse_study
 from tests.jaxmodel.kept import arrays, plant_at, prepared, simulated
 from tests.jaxmodel.test_notch import NOTCHES
 from tests.jaxmodel.test_onset import BASE, HOME

@@ -19,7 +19,7 @@ from jaxmodel.prepare import prepare
 from studies.engine.programs import kept_jit
 from studies.reference import lagrangian as reference
 from studies.study.cases import as_arrays, build_case, build_structure
-from studies.study.spec import paper_study
+from tests.bare import paper_study
 
 SAMPLE = 1e-4  # [s]
 MOVE_TIME, MOVE = 0.05, 0.01  # [s], [m]

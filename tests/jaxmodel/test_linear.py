@@ -17,7 +17,7 @@ from studies.engine.programs import kept_jit
 from studies.engine.runs import _simulate
 from studies.reference import tables
 from studies.study.cases import as_arrays, build_case, build_structure
-from studies.study.spec import paper_study
+from tests.bare import paper_study
 
 UNDAMPED = paper_study().change(
     link__modes=3, link__damping_ratio=0.0, control__feedback="none", drive__kd=0.0

@@ -30,7 +30,7 @@ from studies.space.table import build_table
 from studies.store import Variable
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure
 from studies.study.paths import EACH_LINK, field_value
-from studies.study.spec import load_study, parse_study
+from studies.study.spec import load_study
 from studies.study.template import study_template
 from studies.sweeps.dry_run import axis_rows
 from studies.sweeps.plots import plot
@@ -38,6 +38,7 @@ from studies.sweeps.show import select
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import parse_tuning
 from tests import forms
+from tests.bare import parse_study
 from tests.machines import random_machine
 
 SEEDS = range(10)

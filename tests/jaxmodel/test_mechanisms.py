@@ -25,8 +25,8 @@ from studies.errors import StudyError
 from studies.reference import lagrangian as reference
 from studies.space.spec import parse_sweep
 from studies.study.cases import build_case, build_structure
-from studies.study.spec import paper_study, parse_study
 from studies.study.window import rigid_machine
+from tests.bare import paper_study, parse_study
 from tests.forms import (
     R,
     by_lagrangian,

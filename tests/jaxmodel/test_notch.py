@@ -12,7 +12,7 @@ from studies.engine.controller import check_codable
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.study.cases import build_structure
-from studies.study.spec import paper_study, parse_study
+from tests.bare import paper_study, parse_study
 from tests.jaxmodel import kept
 from tests.jaxmodel.kept import loop_at, nominal_of
 from tests.jaxmodel.test_onset import BASE, HOME, onset_is_at_the_margin

@@ -21,7 +21,7 @@ from studies.engine.stability import loop_report, with_margin_modes
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table
 from studies.study.cases import as_arrays, build_case
-from studies.study.spec import parse_study
+from tests.bare import parse_study
 from tests.canonical import MACHINE
 from tests.jaxmodel.kept import arrays, design_of, loop_at
 from tests.jaxmodel.test_state_space import assert_code_is_the_controller

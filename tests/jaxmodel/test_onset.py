@@ -24,7 +24,8 @@ from studies.engine.robustness import judge_robustness
 from studies.engine.stability import gain_margin, loop_report, with_margin_modes
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.margin import MARGIN_MODES
-from studies.study.spec import Study, parse_study
+from studies.study.spec import Study
+from tests.bare import parse_study
 from tests.machines import random_machine
 
 HOME = (0.0, 0.0, 0.5235987755982988)

@@ -14,8 +14,8 @@ from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.export.in_the_loop import replay
 from studies.single.plant import _plant, controller_of, plant_of, write_system
-from studies.study.spec import parse_study
 from studies.study.template import study_template
+from tests.bare import parse_study
 from tests.jaxmodel.kept import without_run
 from tests.jaxmodel.test_state_space import PERIOD, SHORT, study_with, thirty  # noqa: F401
 from tests.studies.test_cli import refused, run

@@ -26,7 +26,8 @@ from studies.errors import StudyError
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table, case_study
 from studies.study.cases import as_arrays, build_case
-from studies.study.spec import Study, parse_study
+from studies.study.spec import Study
+from tests.bare import parse_study
 from tests.jaxmodel.kept import bases_of, design_of, nominal_of, prepared
 from tests.jaxmodel.kept import without_run as arrays
 

@@ -24,8 +24,8 @@ from studies.engine.runs import _simulate
 from studies.engine.stability import gain_margin, loop_report
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.margin import LOWEST
-from studies.study.spec import paper_study
 from tests import DATA
+from tests.bare import paper_study
 from tests.elements import plant_of_elements
 
 STUDY = paper_study()

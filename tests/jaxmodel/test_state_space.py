@@ -42,8 +42,9 @@ from studies.space.spec import parse_sweep
 from studies.space.table import build_table
 from studies.spillover.certificate import certify
 from studies.spillover.plants import ModelMismatch
-from studies.study.spec import load_study, parse_study
+from studies.study.spec import load_study
 from studies.study.template import study_template
+from tests.bare import parse_study
 from tests.canonical import MACHINE as SHORT
 from tests.exports import needs_compiler
 from tests.jaxmodel.kept import arrays, without_run

@@ -21,7 +21,7 @@ from studies.engine.stability import loop_report
 from studies.fitting.bench import Bench, response
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure, case_of
 from studies.study.signals import INPUTS, OUTPUTS, Signal, parse_signal
-from studies.study.spec import paper_study
+from tests.bare import paper_study
 
 #: Three different links with unequal patches, two of which overlap on the third link.
 UNLIKE = {

@@ -9,7 +9,7 @@ from studies.errors import StudyError
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table
 from studies.study.cases import build_case, build_cases, build_structure
-from studies.study.spec import Study, parse_study
+from studies.study.spec import Study
 from studies.study.window import (
     SETTLED,
     residual_delay,
@@ -18,6 +18,7 @@ from studies.study.window import (
     with_window,
 )
 from studies.tuning.spec import parse_tuning
+from tests.bare import parse_study
 
 STRUCK = {"pulse_force": [20.0, -10.0, 5.0], "pulse_start": 0.002, "pulse_length": 0.002}
 REST = [[0.0, 0.0, 0.5236]]

@@ -29,8 +29,9 @@ from studies.cli import app, console, main
 from studies.engine.modes import machine_modes
 from studies.study.files import READY
 from studies.study.margin import margin_in_db
-from studies.study.spec import load_study, parse_study
+from studies.study.spec import load_study
 from tests import canonical
+from tests.bare import parse_study
 from tests.canonical import HOME, MACHINE
 from tests.documents import page
 from tests.pages import TITLE, parsed, rendered, text_of

@@ -39,10 +39,10 @@ from studies.space.table import build_table
 from studies.store import read_store
 from studies.study.cases import build_case, build_structure
 from studies.study.labels import RESERVED
-from studies.study.spec import parse_study
 from studies.study.template import study_template
 from studies.tuning.spec import parse_tuning
 from tests import TOP
+from tests.bare import parse_study
 from tests.canonical import MACHINE, study_of, text_of
 
 DOCS = TOP / "docs" / "how-to" / "own-parts.md"

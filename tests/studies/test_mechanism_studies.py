@@ -19,9 +19,10 @@ from studies.engine.preflight import check_run
 from studies.extensions import VARIABLE, extend
 from studies.study.cases import build_structure, case_of
 from studies.study.numbers import one_study
-from studies.study.spec import Study, parse_study
+from studies.study.spec import Study
 from studies.verify.machine import check_machine
 from tests import TOP
+from tests.bare import parse_study
 
 GANTRY = TOP / "tests" / "gantry.py"
 SHORT = """

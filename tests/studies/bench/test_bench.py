@@ -12,7 +12,7 @@ from studies import cli
 from studies.bench import peers
 from studies.bench.works import WORKS
 from studies.engine.executor import Executor
-from studies.study.spec import paper_study
+from tests.bare import paper_study
 
 KEYS = "work executor configs_per_s compile_s peak_mib device dtype batch steps fingerprint"
 

@@ -13,7 +13,7 @@ from jaxmodel.simulate import simulate
 from studies.engine.executor import Differentiated
 from studies.engine.runs import _simulate
 from studies.study.cases import as_arrays, build_case, build_structure
-from studies.study.spec import paper_study
+from tests.bare import paper_study
 
 N_CASES = 16
 

@@ -23,7 +23,7 @@ from studies.engine.margins import (
 from studies.engine.stability import LoopFigures
 from studies.study.cases import build_cases, build_structure
 from studies.study.margin import HIGHEST
-from studies.study.spec import paper_study
+from tests.bare import paper_study
 
 # --- Newton's iteration ---------------------------------------------------------------------------
 

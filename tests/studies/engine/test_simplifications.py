@@ -17,7 +17,7 @@ from studies.fitting.spec import parse_fit
 from studies.single.plant import plant_of
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.held_link import first_frequency
-from studies.study.spec import parse_study
+from tests.bare import parse_study
 from tests.canonical import MACHINE, with_sections
 
 #: A link of carbon fibre: light, so that the patches weigh on it.

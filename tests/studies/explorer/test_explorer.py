@@ -19,7 +19,7 @@ from studies.explorer.replays import exaggeration, replayed, rows_to_replay
 from studies.explorer.table import MOST_CASES, Column, ExplorerTable, shown_rows, text_column
 from studies.extensions import VARIABLE, options
 from studies.show.skeleton import Skeleton
-from studies.study.spec import paper_study
+from tests.bare import paper_study
 from tests.browser import opened
 from tests.pages import TITLE, about, unpacked
 from tests.studies.test_cli import refused

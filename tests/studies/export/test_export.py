@@ -19,8 +19,9 @@ from studies.export import sequences, targets
 from studies.export.compiler import STRICT
 from studies.export.document import _of_system, document, import_study, study_hash
 from studies.export.verify import AIM
-from studies.study.spec import load_study, paper_study
+from studies.study.spec import load_study
 from tests import TOP
+from tests.bare import paper_study
 from tests.canonical import MACHINE, with_sections
 from tests.exports import (
     DESIGNS,

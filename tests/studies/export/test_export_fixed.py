@@ -40,7 +40,8 @@ from studies.export.verify import (
     vibration,
 )
 from studies.study.cases import build_structure
-from studies.study.spec import Study, parse_study
+from studies.study.spec import Study
+from tests.bare import parse_study
 from tests.exports import KINDS, PAPER, SINGLE, TUNED, changed, found_and_codes, needs_compiler
 
 RAIL = 100

@@ -24,7 +24,7 @@ from studies.kernels import bridge, gpu, llvm, native
 from studies.kernels.differentiable import DifferentiableLoop
 from studies.kernels.traced import InputLeaf, trace_loop
 from studies.study.cases import build_cases, build_structure
-from studies.study.spec import paper_study
+from tests.bare import paper_study
 from tests.studies.kernels.test_kernel import check_equal, every_operation, smallest
 
 LAYOUT = Layout(devices=1, blocks=2, lanes=gpu.BLOCK)

@@ -21,7 +21,7 @@ from studies.kernels.compilation import ObjectCache
 from studies.kernels.traced import InputLeaf, trace_loop
 from studies.space.table import build_table
 from studies.study.cases import build_cases, build_structure
-from studies.study.spec import paper_study
+from tests.bare import paper_study
 from tests.canonical import HOME, study_of
 from tests.sweeps import MIXED, small_spec
 

@@ -15,7 +15,7 @@ from studies.kernels.derivatives import push_forward
 from studies.kernels.graph import Graph, objects
 from studies.kernels.traced import InputLeaf, trace_loop
 from studies.study.cases import build_cases, build_structure
-from studies.study.spec import paper_study
+from tests.bare import paper_study
 from tests.studies.kernels.test_kernel import every_operation, translated
 
 LAYOUT = Layout(devices=1, blocks=1, lanes=16)

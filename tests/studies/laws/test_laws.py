@@ -58,9 +58,9 @@ from studies.laws.tuning import (
 from studies.show.document import schema
 from studies.space.table import build_table
 from studies.study.cases import build_cases, build_structure
-from studies.study.spec import paper_study, parse_study
 from studies.study.window import with_window
 from studies.tuning.optimise import _fresh_progress
+from tests.bare import paper_study, parse_study
 from tests.canonical import MACHINE, study_of
 from tests.pages import tables_of
 

@@ -38,7 +38,7 @@ from studies.show.units import span
 from studies.store import read_store
 from studies.study.labels import describe
 from studies.study.printed import TABLE_1
-from studies.study.spec import paper_study
+from tests.bare import paper_study
 from tests.pages import text_of
 
 #: Figures that are written; the others are only drawn.

@@ -16,10 +16,10 @@ from studies.errors import StudyError
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table
 from studies.study.cases import as_arrays, build_case, build_structure
-from studies.study.spec import paper_study
 from studies.sweeps.report import report, write_sweep_report
 from studies.sweeps.screening import _rank_correlation, check_screen
 from studies.sweeps.show import ranked_cases, recommended
+from tests.bare import paper_study
 from tests.pages import text_of
 from tests.studies.engine.test_sweeps import partly_done
 from tests.studies.kernels.test_kernel import ALL_SORTS, check_equal

@@ -13,7 +13,6 @@ from studies.spillover.plants import ModelMismatch, PlantVariant
 from studies.spillover.report import document, residual_text, verdict
 from studies.spillover.report import report as certificate_report
 from studies.study.margin import margin_in_db
-from studies.study.spec import paper_study
 from studies.tuning.audit import Disagreement
 from studies.tuning.check import JudgedDesign, OwnRun, patch_centers
 from studies.tuning.loop_figures import DesignFigures
@@ -21,6 +20,7 @@ from studies.tuning.optimise import begin
 from studies.tuning.report import TuneFindings, summary
 from studies.tuning.report import report as tuning_report
 from studies.tuning.spec import parse_tuning
+from tests.bare import paper_study
 from tests.pages import tables_of, text_of
 from tests.studies.show.test_reports import assert_cells
 from tests.tunings import GAIN, SMALL

@@ -15,8 +15,8 @@ from studies.show.units import READABLE, headed, number, readable, settling_text
 from studies.show.words import control_text
 from studies.single.report import report
 from studies.study.cases import build_case, build_structure
-from studies.study.margin import LEFT_OUT, caution, margin_in_db, margin_text
-from studies.study.spec import paper_study
+from studies.study.margin import GUESSED, caution, margin_in_db, margin_text
+from tests.bare import paper_study
 from tests.pages import tables_of, text_of
 
 #: Numbers that no other number of a report equals.
@@ -241,7 +241,7 @@ def test_sentences_of_a_run_show_its_numbers(one_run):
     error = run.result.record.pose_error
     buckling = np.pi**2 * 70e9 * 0.01 * np.array([2e-3, 2.1e-3, 1.9e-3]) ** 3 / 12 / 0.2**2
     for part in (
-        LEFT_OUT,
+        GUESSED,
         f"**Result:** residual {1e6 * rms[worst]:.4g} µm rms on link {worst + 1}, the worst "
         f"({without:.4g} without control, {100 * (1e6 * rms[worst] / without - 1):+.3g} %), gain "
         "margin 3.25 (10.2 dB): ",
@@ -327,4 +327,4 @@ def test_a_run_that_stopped_says_when():
     text = text_of(report("run", run, None, [], "mine"))
     assert "**Result:** the run stopped at 187.5 ms. Status: **diverged: bending beyond a" in text
     assert "residual 0" not in text and "gain margin" not in text
-    assert LEFT_OUT not in text
+    assert GUESSED not in text

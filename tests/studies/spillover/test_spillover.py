@@ -37,9 +37,9 @@ from studies.spillover.plants import LoopBuilder, all_plants, pad_channels
 from studies.spillover.proofs import BOX, AllModes, Proofs, ProvenBox
 from studies.spillover.report import _largest
 from studies.study.cases import as_arrays, build_case, build_structure
-from studies.study.spec import paper_study
 from studies.study.template import study_template
 from studies.study.window import residual_delay
+from tests.bare import paper_study
 from tests.canonical import MACHINE, study_of
 from tests.pages import parsed, text_of
 from tests.studies.test_cli import refused, run

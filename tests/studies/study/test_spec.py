@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from studies import Study, StudyError, load_study, paper_study, parse_study
+from studies import Study, StudyError, load_study
 from studies.reading import read_json
 from studies.study.explain import allowed_values
 from studies.study.template import STARTERS, starter_template, study_template, toml_value
 from studies.verify.prepared import prepared
+from tests.bare import paper_study, parse_study
 from tests.canonical import MACHINE, study_of
 
 REFUSED = [

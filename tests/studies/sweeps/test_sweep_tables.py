@@ -25,7 +25,7 @@ from studies.single.run import Replay
 from studies.space.indices import elementary_effects, sobol_indices
 from studies.space.table import build_table
 from studies.store import Variable
-from studies.study.margin import LEFT_OUT
+from studies.study.margin import GUESSED
 from studies.sweeps.documents import best_document
 from studies.sweeps.dry_run import axis_rows
 from studies.sweeps.environments import environments_text
@@ -318,7 +318,7 @@ def test_margins_are_shown_with_what_they_leave_out(capsys):
     for variables in (data.variables, without, usual(gain_margin=np.full(8, np.nan)).variables):
         print_cases(replace(data, variables=variables), np.array([0]), ["residual_rms"], Console())
         shown.append(" ".join(capsys.readouterr().out.split()))
-    assert [LEFT_OUT in text for text in shown] == [True, False, False]
+    assert [GUESSED in text for text in shown] == [True, False, False]
 
 
 # --- failures -------------------------------------------------------------------------------------

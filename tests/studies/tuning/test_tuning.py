@@ -16,7 +16,6 @@ from studies.engine.runs import run_study
 from studies.errors import StudyError
 from studies.space.axes import Range
 from studies.space.free import Free, FreeNumbers
-from studies.study.spec import paper_study
 from studies.tuning import linear_fidelity, loop_figures, loop_programs
 from studies.tuning.check import tuned_study
 from studies.tuning.evaluate import Evaluation
@@ -37,6 +36,7 @@ from studies.tuning.report import violated_limits
 from studies.tuning.run import make_evaluator
 from studies.tuning.scenarios import scenario_columns, tuned_machines
 from studies.tuning.spec import Family, Tune, TuneSpec
+from tests.bare import paper_study
 from tests.tunings import EACH, EVERY_KIND, GAIN, tuning
 
 # --- objective and limits -------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from studies.space.spec import parse_sweep
 from studies.store import read_store
 from studies.study import spec as spec_module
 from studies.study.files import read_toml
-from studies.study.spec import load_study, paper_study
+from studies.study.spec import load_study
 from studies.sweeps.show import ranked_cases
 from studies.tuning import audit as audit_module
 from studies.tuning import results
@@ -35,6 +35,7 @@ from studies.tuning.optimise import begin, is_compatible
 from studies.tuning.report import TuneFindings, best_family, n_outside, rank_correlation, report
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import load_tuning, parse_tuning
+from tests.bare import paper_study
 from tests.pages import about, parsed, text_of
 from tests.tunings import GAIN, SMALL, tuning
 

@@ -12,7 +12,6 @@ from studies.errors import StudyError
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.numbers import one_study
 from studies.study.paths import Parts, set_value
-from studies.study.spec import parse_study
 from studies.tuning import evaluate
 from studies.tuning.check import fresh_columns
 from studies.tuning.evaluate import Evaluator
@@ -24,6 +23,7 @@ from studies.tuning.objective import (
 )
 from studies.tuning.scenarios import lane_columns, scenario_columns, tuned_machines
 from studies.tuning.spec import parse_tuning
+from tests.bare import parse_study
 from tests.tunings import EVERY_KIND, GAIN, SMALL, tuning
 
 

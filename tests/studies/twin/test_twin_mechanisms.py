@@ -14,7 +14,6 @@ from jaxmodel.mechanisms.carriers import Rail
 from jaxmodel.prepare import prepare
 from jaxmodel.simulate import simulate
 from studies.engine.design import Design
-from studies.study.spec import parse_study
 from studies.twin import compare
 from studies.twin.chain import close_chain, lever
 from studies.twin.loop import run_twin
@@ -23,6 +22,7 @@ from studies.twin.multibody import Settings, build_model
 from studies.twin.plan import plan_run
 from studies.twin.plots import side_by_side
 from studies.twin.run import twin_design
+from tests.bare import parse_study
 from tests.jaxmodel.test_mechanisms import MACHINES, POSES, case_of
 from tests.studies.twin.test_twin import EVERYTHING, SHORT, STIFF, differences, needs_exudyn
 

@@ -20,11 +20,12 @@ from studies import passport
 from studies.reference import tables
 from studies.show.document import schema
 from studies.study.cases import as_arrays, build_case, build_structure
-from studies.study.spec import load_study, paper_study, parse_study
+from studies.study.spec import load_study
 from studies.verify import commands, links, loops, machine, outside, run, stepping, trajectories
 from studies.verify.prepared import prepared
 from studies.verify.rows import Assumption, largest, worst, worst_relative
 from tests import TOP
+from tests.bare import paper_study, parse_study
 from tests.canonical import TINY, study_of, with_sections
 from tests.machines import random_machine
 from tests.studies.test_cli import run as call
@@ -172,7 +173,7 @@ _CHECK = """
 import json, sys
 from studies.config import start
 start()
-from studies.study.spec import parse_study
+from tests.bare import parse_study
 from studies.verify.run import CHECKS
 machine = {"load": {"mass": 0.1, "inertia": 1e-4, "offset": [0.02, 0.01]}}
 names = [name for name in CHECKS if name.startswith(sys.argv[1])]
