@@ -198,12 +198,19 @@ def _origin(exported: FixedController, case_id: str) -> list[str]:
     study = exported.study
     links = "+".join(str(i + 1) for i, is_on in enumerate(study.control.links) if is_on)
     package = f"{config.PACKAGE} {config.info()[config.PACKAGE]}"
+    wiring = []
+    if study.patches.actuators == "both faces":
+        wiring = [
+            "Each actuator is a pair, one patch on each face, wired with opposite polarity to"
+        ]
+        wiring += ["one amplifier, which has twice the capacitance to drive"]
     return [
         f"{study.title}",
         f"Exported by {package}; study SHA-256 {study_hash(study)}"
         + (f"; case {case_id} of a sweep" if case_id else ""),
         f"Law {study.control.law}, basis {study.control.basis}, controlled links {links}, "
         f"velocity estimate {study.electronics.estimator}, shaper {study.shaper.kind}",
+        *wiring,
     ]
 
 
