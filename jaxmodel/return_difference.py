@@ -286,7 +286,13 @@ def evaluate_loop_gain(
     links = sum(shares[1:], start=shares[0])
     pose = s * s * response.mass + s * response.damping + response.stiffness - links
     whole = determinant(pose)
-    return LoopGain(own, joint, pose, whole.inverse(), whole * stiff)
+    return LoopGain(
+        own=own,
+        joint=joint,
+        pose=pose,
+        pose_inverse=whole.inverse(),
+        assembled=whole * stiff,
+    )
 
 
 def _one_link(response: LoopResponse, i: int, has_channels: bool) -> LoopResponse:
