@@ -5,23 +5,47 @@ from closed forms and codes of such links. `tests/jaxmodel/test_stretch.py` has 
 """
 
 from studies.bench.works import BARE
+from studies.fitting import spec as fitting_spec
+from studies.space import spec as space_spec
 from studies.study import spec
 from studies.study.spec import Study
+from studies.tuning import spec as tuning_spec
+
+
+def bare(data):
+    """The data of a study, sweep, tuning or fit with defaults of bare links."""
+    data = {name: dict(part) if isinstance(part, dict) else part for name, part in data.items()}
+    machine = data.get("machine")
+    links = 2 if isinstance(machine, dict) and machine.get("kind") == "five_bar" else 3
+    for name, value in BARE.items():
+        section, field = name.split("__")
+        part = data.setdefault(section, {})
+        if not isinstance(part, dict) or (field == "velocity_gain" and "damping" in part):
+            continue
+        part.setdefault(field, list(value[:links]) if isinstance(value, tuple) else value)
+    return data
 
 
 def parse_study(data):
     """`studies.study.spec.parse_study` with defaults of bare links."""
-    data = {name: dict(part) if isinstance(part, dict) else part for name, part in data.items()}
-    kinds = {"five_bar": 2}
-    links = kinds.get(data.get("machine", {}).get("kind", "prrr"), 3)
-    for name, value in BARE.items():
-        section, field = name.split("__")
-        part = data.setdefault(section, {})
-        if isinstance(part, dict):
-            part.setdefault(field, value[:links] if isinstance(value, tuple) else value)
-    return spec.parse_study(data)
+    return spec.parse_study(bare(data))
 
 
 def paper_study() -> Study:
     """`studies.study.spec.paper_study` of bare links."""
     return spec.paper_study().change(**BARE)
+
+
+def parse_sweep(data):
+    """`studies.space.spec.parse_sweep` with defaults of bare links."""
+    return space_spec.parse_sweep(bare(data))
+
+
+def parse_tuning(data):
+    """`studies.tuning.spec.parse_tuning` with defaults of bare links."""
+    return tuning_spec.parse_tuning(bare(data))
+
+
+def parse_fit(data, folder="."):
+    """`studies.fitting.spec.parse_fit` with defaults of bare links."""
+    return fitting_spec.parse_fit(bare(data), folder)

@@ -13,12 +13,11 @@ from studies.export.fixed import dac_step_of
 from studies.export.in_the_loop import run_controller
 from studies.export.run import DAC_BITS
 from studies.fitting.measurements import make_bench, make_measurements
-from studies.fitting.spec import parse_fit
 from studies.study.cases import build_case, build_structure
 from studies.study.signals import INPUTS, OUTPUTS, parse_signal
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import parse_tuning
-from tests.bare import paper_study, parse_study
+from tests.bare import paper_study, parse_fit, parse_study
 from tests.elements import response_of_elements
 from tests.fits import write
 

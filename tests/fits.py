@@ -7,8 +7,8 @@ from studies.fitting.kinds.motions import Recording
 from studies.fitting.measurements import guess, make_bench, make_measurements
 from studies.fitting.problem import make_problem
 from studies.fitting.solve import descend
-from studies.fitting.spec import parse_fit
 from studies.fitting.statistics import describe_fit
+from tests.bare import parse_fit
 
 SHORT = {
     "run": {"duration": 0.06},

@@ -8,7 +8,7 @@ import numpy as np
 
 from studies.engine import plan
 from studies.screen import shards
-from studies.space.spec import parse_sweep
+from tests.bare import bare, parse_sweep
 
 HOME_PHI = float(np.pi / 6)
 #: 2 mm in 15 ms, then 10 ms; two modes.
@@ -33,7 +33,7 @@ MIXED = {
 
 def small(sweep=MIXED, **sections):
     """Dictionary of a sweep on the small machine."""
-    data = copy.deepcopy(BASE) | copy.deepcopy(sections)
+    data = bare(copy.deepcopy(BASE) | copy.deepcopy(sections))
     return data | {"sweep": copy.deepcopy(sweep)}
 
 

@@ -1,7 +1,6 @@
 """A tuning of a small machine that the tests of tunings share."""
 
-from studies.tuning.spec import parse_tuning
-from tests.bare import paper_study
+from tests.bare import paper_study, parse_tuning
 
 HOME = list(paper_study().motion.waypoints[0])
 SMALL = {

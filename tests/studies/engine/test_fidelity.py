@@ -6,8 +6,8 @@ import pytest
 from studies.engine import fidelity
 from studies.engine.fidelity import Agreement, agreement
 from studies.errors import StudyError
-from studies.space.spec import parse_sweep
 from studies.space.table import build_table
+from tests.bare import parse_sweep
 from tests.canonical import TINY
 
 GAINS = TINY | {

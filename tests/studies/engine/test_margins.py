@@ -27,11 +27,11 @@ from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.results import read_sweep
 from studies.engine.stability import loop_report, with_margin_modes
 from studies.engine.sweep import run_sweep
-from studies.space.spec import parse_sweep
 from studies.space.table import build_table
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure
 from studies.study.margin import HIGHEST, LOWEST
 from studies.sweeps.show import ranked_cases
+from tests.bare import parse_sweep
 from tests.canonical import MACHINE, study_of
 from tests.jaxmodel.test_notch import NOTCHES
 from tests.loops import Loops, exact_margins, matrices, random_loops

@@ -12,11 +12,10 @@ from studies.engine import programs
 from studies.engine.preflight import preflight
 from studies.engine.runs import run_study
 from studies.engine.sweep import run_sweep
-from studies.space.spec import parse_sweep
 from studies.study.cases import build_case, build_structure
 from studies.tuning.loop_figures import loop_figures
-from studies.tuning.spec import parse_tuning
 from tests import TOP
+from tests.bare import parse_sweep, parse_tuning
 from tests.canonical import TINY, study_of
 
 PACKAGES = tuple(str(TOP / package) + "/" for package in sources.PACKAGES)

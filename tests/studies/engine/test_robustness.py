@@ -35,7 +35,6 @@ from studies.engine.robustness import (
 from studies.engine.stability import _loops, with_margin_modes
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
-from studies.space.spec import parse_sweep
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure
 from studies.sweeps.show import ranked_cases
 from studies.tuning import loop_figures
@@ -43,6 +42,7 @@ from studies.tuning.check import tuned_study
 from studies.tuning.linear_fidelity import LinearFidelity
 from studies.tuning.loop_figures import machine_figures, term_values
 from studies.tuning.spec import LOOP_TERMS
+from tests.bare import parse_sweep
 from tests.canonical import MACHINE, study_of
 from tests.tunings import EACH, EVERY_KIND, GAIN, SMALL, tuning
 

@@ -13,11 +13,10 @@ from studies.engine.preflight import check_run
 from studies.engine.simplifications import warn_of_sizes
 from studies.errors import ModelWarning, StudyError
 from studies.fitting.measurements import make_bench, make_measurements
-from studies.fitting.spec import parse_fit
 from studies.single.plant import plant_of
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.held_link import first_frequency
-from tests.bare import parse_study
+from tests.bare import parse_fit, parse_study
 from tests.canonical import MACHINE, with_sections
 
 #: A link of carbon fibre: light, so that the patches weigh on it.

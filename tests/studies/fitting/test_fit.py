@@ -31,12 +31,12 @@ from studies.fitting.profiles import profile
 from studies.fitting.report import sentences, undetermined
 from studies.fitting.run import machines, run_fit
 from studies.fitting.solve import descend, solve
-from studies.fitting.spec import parse_fit
 from studies.fitting.statistics import describe_fit
 from studies.fitting.tables import column, read_columns
 from studies.publish import check_folder
 from studies.study.spec import load_study
 from studies.tuning.spec import load_tuning
+from tests.bare import parse_fit
 from tests.fits import (
     ACCELEROMETER,
     FIGURES,

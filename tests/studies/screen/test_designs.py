@@ -35,9 +35,10 @@ from studies.screen.tally import (
     quantile,
     tally_of,
 )
-from studies.space.spec import load_sweep, parse_sweep
+from studies.space.spec import load_sweep
 from studies.space.table import build_table
 from studies.store import Variable, read_store, write_store
+from tests.bare import parse_sweep
 from tests.pages import text_of
 from tests.sweeps import narrow_blocks, small, small_spec
 

@@ -13,13 +13,12 @@ from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import _simulate
 from studies.engine.sweep import make_plan, run_sweep
 from studies.errors import StudyError
-from studies.space.spec import parse_sweep
 from studies.space.table import build_table
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.sweeps.report import report, write_sweep_report
 from studies.sweeps.screening import _rank_correlation, check_screen
 from studies.sweeps.show import ranked_cases, recommended
-from tests.bare import paper_study
+from tests.bare import paper_study, parse_sweep
 from tests.pages import text_of
 from tests.studies.engine.test_sweeps import partly_done
 from tests.studies.kernels.test_kernel import ALL_SORTS, check_equal

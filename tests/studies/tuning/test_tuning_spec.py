@@ -22,8 +22,7 @@ from studies.tuning.objective import (
     tail_weights,
 )
 from studies.tuning.scenarios import lane_columns, scenario_columns, tuned_machines
-from studies.tuning.spec import parse_tuning
-from tests.bare import parse_study
+from tests.bare import parse_study, parse_tuning
 from tests.tunings import EVERY_KIND, GAIN, SMALL, tuning
 
 
