@@ -28,6 +28,7 @@ from studies.show.document import schema
 from studies.spillover.certificate import certify
 from studies.tuning.folder import open_tuning
 from studies.tuning.spec import parse_tuning
+from tests.bare import bare
 from tests.canonical import MACHINE, TINY, study_of
 from tests.commissions import (
     margin_on,
@@ -47,7 +48,7 @@ FREE = {"link.youngs_modulus": {"from": 60e9, "to": 80e9}}
 
 
 def data(**sections):
-    return TINY | {"fit": {"free": FREE, "data": [MODES]}} | sections
+    return bare(TINY) | {"fit": {"free": FREE, "data": [MODES]}} | sections
 
 
 # --- the file -------------------------------------------------------------------------------------

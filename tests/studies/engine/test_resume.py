@@ -37,6 +37,7 @@ from studies.space.table import build_table
 from studies.store import Variable, write_store
 from studies.tuning.folder import open_tuning
 from tests import TOP
+from tests.bare import bare
 from tests.canonical import TINY
 from tests.sweeps import narrow_blocks
 
@@ -51,7 +52,8 @@ def small_chunks():
 
 
 def request(**changes):
-    return {"title": "resumed", **copy.deepcopy(TINY), "sweep": copy.deepcopy(SWEEP) | changes}
+    data = bare(copy.deepcopy(TINY))
+    return {"title": "resumed", **data, "sweep": copy.deepcopy(SWEEP) | changes}
 
 
 def run(data, out, **options):

@@ -15,6 +15,7 @@ from studies.engine.function import STEPPERS
 from studies.errors import NoKernelError, NoKernelWarning
 from studies.kernels import cpu, graph
 from studies.kernels.equations import call_of, literal, scan_of, trace
+from tests.bare import bare
 from tests.canonical import study_of, text_of
 from tests.studies.kernels.test_kernel import RELEASED, check_equal, smallest, translated
 from tests.studies.kernels.test_tangents import LAYOUT, N_PARAMETERS, place
@@ -138,7 +139,7 @@ gain = [0.2, 0.4]
 @pytest.mark.long  # in short: executors are named, below
 def test_a_sweep_runs_by_the_scan_and_says_so(capsys, tmp_path, no_structure):
     path = tmp_path / "small.toml"
-    path.write_text(text_of(RELEASED) + SWEEP)
+    path.write_text(text_of(bare(RELEASED)) + SWEEP)
     with narrow_blocks(16):
         code, text, errors = run(capsys, "sweep", path, "--out", tmp_path / "out")
     assert code == 0 and "2/2 cases" in text and "Traceback" not in text + errors
