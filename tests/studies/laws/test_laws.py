@@ -58,6 +58,7 @@ from studies.laws.tuning import (
 from studies.show.document import schema
 from studies.space.table import build_table
 from studies.study.cases import build_cases, build_structure
+from studies.study.spec import Study
 from studies.study.window import with_window
 from studies.tuning.optimise import _fresh_progress
 from tests.bare import paper_study, parse_study
@@ -182,7 +183,8 @@ def test_noise_is_that_of_the_design_or_one_step_of_its_converter():
 
 def assert_kept(law):
     """A law on a design with specified poles."""
-    placed = STUDY.change(control__damping=0.1)
+    gain = Study().control.velocity_gain  # as by default: the damping decides
+    placed = STUDY.change(control__damping=0.1, control__velocity_gain=gain)
     candidate = law_candidate(placed, law)
     assert candidate.study(placed).control.law == candidate.settings["control.law"] == law.name
     tuning_of(placed, candidate, Budget(50.0, 0.4))

@@ -12,6 +12,7 @@ from studies.engine.sweep import run_sweep
 from studies.space import table as tables
 from studies.space.table import build_table, designs
 from studies.study.fields import _LAWS, _RULES, idle_axes
+from studies.study.spec import Study
 from studies.sweeps.dry_run import axis_records
 from tests.canonical import MACHINE
 from tests.studies.test_cli import run
@@ -58,7 +59,11 @@ BASE = MACHINE | {"shaper": {"kind": "none", "frequencies_hz": [80.0]}}
 
 
 def spec_of(idle, **sections):
-    return small_spec({"method": "list", "cases": cases_of(idle)}, **BASE | sections)
+    # with the default gains, in whose place `control.damping` may stand
+    control = {"velocity_gain": list(Study().control.velocity_gain)} | sections.pop("control", {})
+    return small_spec(
+        {"method": "list", "cases": cases_of(idle)}, **BASE | sections, control=control
+    )
 
 
 @pytest.mark.parametrize("idle", IDLE, ids=IDS)
