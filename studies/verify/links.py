@@ -58,10 +58,10 @@ def check_links(study: Study) -> list[Assumption]:
         bends = beside[:, 1] - beside[:, 0]
         gain = _opposite_gain(patches, sections, constants) if structure.has_stretch else 0.0
         signals.append(_signals(loop, i, constants, bends, basis, gain))
-        layers = _Layers(sections, constants, *_membrane(beam, patches, constants))
-        statics.append(_statics(loop, i, layers, gain))
+        membrane = _membrane(beam, patches, constants)
+        statics.append(_statics(loop, i, sections, (*constants, *membrane), gain))
         if structure.has_stretch:
-            axial.append(_elongation(loop, i, layers))
+            axial.append(_elongation(loop, i, sections, membrane))
     return [
         _frequencies(study, loop, case),
         Assumption(
@@ -304,15 +304,6 @@ def _sensor_arm(beam: Beam, patches: Patches) -> float:
     return thick / 2 + (0 if patches.is_paired else skin * (thick + piezo) / 2 / (skin + core))
 
 
-class _Layers(NamedTuple):
-    """A link and its patches, by layers."""
-
-    sections: list[Segment]
-    constants: tuple[float, float]  # of `_constants`
-    force: float  # an actuator's push along the link [N/V]
-    membrane: float  # volts per elongation of a sensor's span [V/m]
-
-
 def _membrane(beam: Beam, patches: Patches, constants: tuple[float, float]) -> tuple[float, float]:
     """Push [N/V] of an actuator, none of a pair, and volts per elongation [V/m]."""
     strained = float(patches.youngs_modulus) * abs(float(patches.d31)) * float(patches.width)
@@ -350,31 +341,39 @@ def _signals(
     return worst(sees, does)
 
 
-def _statics(loop: Loop, i: int, layers: _Layers, gain: float) -> float:
+def _statics(
+    loop: Loop,
+    i: int,
+    sections: list[Segment],
+    constants: tuple[float, float, float, float],
+    gain: float,
+) -> float:
     """Held voltages: sensors by all modes, against moments integrated over the link.
 
-    Links that lengthen are free of tension.
+    Links that lengthen are free of tension; constants are those of `_constants` and `_membrane`.
     """
     if loop.left_out is None:
         return 0.0
-    actuator, sensor = layers.constants
+    actuator, sensor, force, membrane = constants
     wanted = np.zeros_like(loop.left_out.sensor[i])
-    for section in layers.sections:
+    for section in sections:
         width = section.right - section.left
         for k in section.sensors:
             for m in section.actuators:
                 wanted[k, m] += sensor * actuator * (1 + gain) * width / section.stiffness
                 if loop.plant.stretch is not None:
-                    wanted[k, m] += layers.membrane * layers.force * width / section.axial
+                    wanted[k, m] += membrane * force * width / section.axial
     stiffness = loop.plant.stiffness[i] / loop.plant.modal_mass[i]
     modal = (loop.sensor[i] / stiffness) @ loop.actuator[i]
     return largest(modal + loop.left_out.sensor[i], wanted)
 
 
-def _elongation(loop: Loop, i: int, layers: _Layers) -> float:
+def _elongation(
+    loop: Loop, i: int, sections: list[Segment], constants: tuple[float, float]
+) -> float:
     """Stiffness, inertia, forces and volts of a link's elongation, section by section."""
     assert loop.plant.stretch is not None
-    sections, scale = layers.sections, float(loop.plant.stretch[i])
+    (force, membrane), scale = constants, float(loop.plant.stretch[i])
     soft = np.array([(s.right - s.left) / s.axial for s in sections])
     ends = np.append(0.0, np.cumsum(soft)) / soft.sum()
     squares = (ends[1:] ** 2 + ends[1:] * ends[:-1] + ends[:-1] ** 2) / 3
@@ -388,7 +387,6 @@ def _elongation(loop: Loop, i: int, layers: _Layers) -> float:
     return worst(
         largest(loop.plant.stiffness[i, -1] / scale**2, 1 / soft.sum()),
         largest(own / scale**2, mass),
-        largest(loop.sensor[i, :, -1] / scale, layers.membrane * seen),
-        np.abs(loop.actuator[i, -1] * own / scale - layers.force * pushed).max()
-        / max(layers.force, 1e-9),
+        largest(loop.sensor[i, :, -1] / scale, membrane * seen),
+        np.abs(loop.actuator[i, -1] * own / scale - force * pushed).max() / max(force, 1e-9),
     )

@@ -29,6 +29,8 @@ PUBLISHED = {
     ("loaded", True, 0.01): (1.899, 1266, None, (0.1376, 0.1527, 0.1570)),
     ("loaded", True, 0.03): (2.581, 1296, None, (0.1376, 0.1527, 0.1570)),
 }
+#: The others are judged by the same few lines; in short the first one.
+KINDS = ["prrr", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("rrr", "five_bar"))]
 CONTROL = {"basis": "pinned_pinned", "velocity_gain": [1.55, 1.75, 1.7]}
 
 
@@ -61,7 +63,7 @@ def test_margins_and_damping_are_those_of_two_independent_codes(machine):
     assert report.breaking.startswith("stretch of links") != bending
 
 
-@pytest.mark.parametrize("kind", ["prrr", "rrr", "five_bar"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_batches_judge_loops_as_eigenvalues_do(kind):
     study = study_of(kind=kind)
     structure, case = build_structure(study), build_case(study)
@@ -161,7 +163,7 @@ def test_static_volts_per_volt_are_a_closed_form(basis, stretch, rounded):
         np.testing.assert_allclose(wanted, ELASTICITY, rtol=0.06)
 
 
-@pytest.mark.parametrize("kind", ["prrr", "rrr", "five_bar"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_responses_in_closed_form_are_those_of_the_sampled_plant(kind):
     study = study_of(kind=kind)
     structure, case = with_margin_modes(build_structure(study), build_case(study), 8)
