@@ -27,7 +27,7 @@ RIGID = 1e-6
 class ModeKind(NamedTuple):
     """What holds most of a mode's energy."""
 
-    kind: str  # "link", "drive", or "rigid": nothing holds it
+    kind: str  # "link", "stretch": links lengthen, "drive", or "rigid": nothing holds it
     share: float = np.nan  # of the potential energy [1]
     links: tuple[int, ...] = ()  # which take part, from 1
     order: int | None = None  # of the links' mode, from 1
@@ -41,8 +41,11 @@ class ModeKind(NamedTuple):
         percent = f"{100 * self.share:.0f} %"
         if self.kind == "drive":
             return f"drive, platform {self.platform}, {percent}"
-        numbers = " ".join(map(str, self.links))
-        return f"link{'s' * (len(self.links) > 1)} {numbers}, mode {self.order}, {percent}"
+        is_one = len(self.links) == 1
+        links = f"link{'' if is_one else 's'} {' '.join(map(str, self.links))}"
+        if self.kind == "stretch":
+            return f"{links} lengthen{'s' if is_one else ''}, {percent}"
+        return f"{links}, mode {self.order}, {percent}"
 
 
 class NamedModes(NamedTuple):
@@ -58,9 +61,10 @@ class NamedModes(NamedTuple):
     frequency: np.ndarray  # |lambda|/2 pi [Hz], (m,)
     damping_ratio: np.ndarray  # [1], (m,)
     shape: np.ndarray  # (X, q) part of the eigenvectors, largest entry 1, (n, m), one per column
-    link_share: np.ndarray  # [1], (m, 3, R)
+    link_share: np.ndarray  # [1], (m, 3, R), or (m, 3, R + 1) with elongations last
     drive_share: np.ndarray  # [1], (m,)
     turn_share: np.ndarray  # of the platform's kinetic energy that is in rotation [1], (m,)
+    has_stretch: bool = False  # links lengthen
 
     def _repr_html_(self) -> str:
         return shown(self)
@@ -69,7 +73,7 @@ class NamedModes(NamedTuple):
     def kinds(self) -> list[ModeKind]:
         """What each mode is."""
         shares = zip(self.link_share, self.drive_share, self.turn_share, strict=True)
-        return [_kind(*share) for share in shares]
+        return [_kind(*share, self.has_stretch) for share in shares]
 
     @property
     def names(self) -> list[str]:
@@ -77,7 +81,9 @@ class NamedModes(NamedTuple):
         return [kind.description for kind in self.kinds]
 
 
-def _kind(link_share: np.ndarray, drive_share: float, turn_share: float) -> ModeKind:
+def _kind(
+    link_share: np.ndarray, drive_share: float, turn_share: float, has_stretch: bool
+) -> ModeKind:
     if np.isnan(drive_share):
         return ModeKind("rigid")
     if drive_share > 0.5:
@@ -86,9 +92,10 @@ def _kind(link_share: np.ndarray, drive_share: float, turn_share: float) -> Mode
     order = int(link_share.sum(axis=0).argmax())
     share = link_share[:, order]
     links = np.flatnonzero(share >= share.max() / 3)  # the others hardly take part
-    return ModeKind(
-        "link", float(share[links].sum()), links=tuple((links + 1).tolist()), order=order + 1
-    )
+    kind = ModeKind("link", float(share[links].sum()), tuple((links + 1).tolist()), order + 1)
+    if has_stretch and order == len(link_share[0]) - 1:
+        return kind._replace(kind="stretch", order=None)
+    return kind
 
 
 def modes_study(
@@ -102,7 +109,8 @@ def modes_study(
     n_modes: int | None = None,
 ) -> Study:
     """The study to linearise; bad values are rejected as in a study file."""
-    undamped = {"link": {"modes": 3, "damping_ratio": 0.0}, "drive": {"kd": 0.0}}
+    links = {"modes": 3, "damping_ratio": 0.0, "stretch_damping": 0.0}
+    undamped = {"link": links, "drive": {"kd": 0.0}}
     data: dict[str, Any] = (
         undamped if study is None else study.model_dump(mode="json", exclude_unset=True)
     )
@@ -156,6 +164,7 @@ def machine_modes(study: Study | None = None, **changes: Any) -> NamedModes:
         link_share=link_share,
         drive_share=1 - link_share.sum(axis=(1, 2)),
         turn_share=_turn_shares(shape, mass, structure.n_pose),
+        has_stretch=structure.has_stretch,
     )
 
 

@@ -198,7 +198,7 @@ def test_a_run(document, tmp_path):
 
 def test_settings_and_modes(document):
     assert document("info")["precision"] == "float64"
-    assert len(document("modes", "--modes", 2)["modes"]) == 9
+    assert len(document("modes", "--modes", 2)["modes"]) == 3 + 3 * (2 + 1)  # links lengthen
     free = document("modes", "--modes", 2, "--kp", 0)["modes"][0]
     assert (free["kind"], free["share"], free["links"]) == ("rigid", None, [])
     assert document("cache")["is_cleared"] is False

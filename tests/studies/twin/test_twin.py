@@ -18,6 +18,7 @@ from jaxmodel.beam import BASES, by_link
 from jaxmodel.piezo import actuator_constant, sensor_constant
 from jaxmodel.static import static_bending
 from jaxmodel.stretch import find_stretch
+from studies.bench.works import BARE
 from studies.engine.design import Design
 from studies.engine.preflight import check_run
 from studies.engine.stability import loop_report
@@ -61,7 +62,7 @@ def machine_of(**fields):
 
 
 def test_mesh_has_nodes_at_patch_ends_and_modes_of_a_pinned_beam():
-    link = machine_of(patches__centers=(0.047, 0.101, 0.16)).links[0]
+    link = machine_of(**BARE, patches__centers=(0.047, 0.101, 0.16)).links[0]
     mesh = mesh_link(link, 40)
     np.testing.assert_allclose(mesh.x[mesh.sensor_nodes], link.sensor_ends, atol=1e-12)
     np.testing.assert_allclose(mesh.x[mesh.actuator_nodes], link.actuator_ends, atol=1e-12)
@@ -459,8 +460,12 @@ def test_voltages_change_in_the_middle_of_the_step_at_the_sample():
     assert put == [2.0, 1.0]
 
 
-def test_each_change_has_the_differences_without_and_with_control(monkeypatch):
-    """Of made-up runs: the twin's motion is 2 times ours without control, 5 times with it."""
+@pytest.mark.parametrize("stretch", [False, True])
+def test_each_change_has_the_differences_without_and_with_control(monkeypatch, stretch):
+    """Of made-up runs: the twin's motion is 2 times ours without control, 5 times with it.
+
+    The twin's links are stiffened in tension where the model's keep their length.
+    """
 
     def signals(size):
         return compare.RunSignals(*(np.full((4, 3, *more), size) for more in ((), (), (1,))))
@@ -477,12 +482,16 @@ def test_each_change_has_the_differences_without_and_with_control(monkeypatch):
 
     monkeypatch.setattr(compare, "TwinBench", Bench)
     monkeypatch.setattr(compare, "pair", compare.BothModels)
-    study = Study().change(link__modes=compare.MOST_MODES, electronics__adc_noise=1e-4)
+    study = Study().change(
+        link__modes=compare.MOST_MODES, link__stretch=stretch, electronics__adc_noise=1e-4
+    )
     ours, bench = signals(1.0), Bench(study, STIFF)
     free, controlled = (compare.BothModels(ours, bench.run(x)) for x in (False, True))
     found = compare.causes(bench, (ours, ours), compare.BothRuns(free, controlled))
-    assert len(found) == 4
-    np.testing.assert_allclose([x[1:] for x in found], [[0.5, 0.8, 0.8]] * 4)
+    stiffened = [] if stretch else ["twin: links 1000 times stiffer in tension"]
+    assert [x.text for x in found if "tension" in x.text] == stiffened
+    assert len(found) == 3 + len(stiffened)
+    np.testing.assert_allclose([x[1:] for x in found], [[0.5, 0.8, 0.8]] * len(found))
 
 
 def test_the_command_writes_report_figure_and_numbers(tmp_path, capsys, monkeypatch):

@@ -19,6 +19,7 @@ from jaxmodel.shaper import SHAPERS, Impulses
 from studies import passport
 from studies.reference import tables
 from studies.show.document import schema
+from studies.study import spec
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import load_study
 from studies.verify import commands, links, loops, machine, outside, run, stepping, trajectories
@@ -173,11 +174,12 @@ _CHECK = """
 import json, sys
 from studies.config import start
 start()
-from tests.bare import parse_study
+from studies.bench.works import BARE
+from studies.study.spec import parse_study
 from studies.verify.run import CHECKS
 machine = {"load": {"mass": 0.1, "inertia": 1e-4, "offset": [0.02, 0.01]}}
 names = [name for name in CHECKS if name.startswith(sys.argv[1])]
-rows = [row for name in names for row in CHECKS[name](parse_study(machine))]
+rows = [row for name in names for row in CHECKS[name](parse_study(machine).change(**BARE))]
 print(json.dumps([row.assumption for row in rows if not row.is_passed]))
 """
 
@@ -292,10 +294,10 @@ CHEAP = ("links and patches", "trajectories and shapers", "mechanics")
 
 
 def drawn(seed):
-    """A random machine, its links with or without loads at their ends."""
+    """A random machine, its links bare or with patches as they are, which lengthen them."""
     shaper = {"kind": "ei_damped", "frequencies_hz": [100.0, 410.0], "split": "exact"}
-    basis = {"basis": ("pinned_pinned", "loaded")[seed % 2]}
-    return random_machine(seed, link=basis, shaper=shaper)
+    link = {"basis": ("pinned_pinned", "loaded")[seed % 2], "stretch": bool(seed % 2)}
+    return random_machine(seed, link=link, shaper=shaper)
 
 
 # in short: the other basis in the next test, but for the mechanics
@@ -303,7 +305,8 @@ def drawn(seed):
 def test_random_machines_pass(seed):
     study = drawn(seed)
     rows = [row for name in CHEAP for row in run.CHECKS[name](study)]
-    assert len(rows) == 12 and all(row.is_passed for row in rows), rows
+    assert len(rows) == 13 and all(row.is_passed for row in rows), rows
+    assert [row.left_out for row in rows if row.left_out] == ["link.stretch is off"] * (seed == 2)
 
 
 def test_a_fault_fails_its_row():
@@ -406,7 +409,7 @@ def test_accelerations_of_the_modes_are_compared_like_those_of_the_pose(monkeypa
     found, wanted = np.ones((4, 5)), np.ones((4, 5))
     wanted[2, 4] = 1.25
     for name, result in (
-        ("_plant", {}),
+        ("_plant", ({}, None)),
         ("_random_states", None),
         ("_both", (found, wanted, np.zeros(4))),
     ):
@@ -448,7 +451,7 @@ def checks(monkeypatch, tmp_path):
 def test_the_command(checks, capsys, tmp_path):
     code, out, _ = call(capsys, "verify")
     assert code == 0 and "1 of 1 assumptions passed" in out and "left out: x: nothing there" in out
-    found = passport.find(paper_study())
+    found = passport.find(spec.paper_study())
     assert found is not None and (found.passed, found.rows, found.failed) == (1, 1, ())
 
     (tmp_path / "heavy.toml").write_text("[machine]\nplatform_mass = 0.5\n")
@@ -459,7 +462,8 @@ def test_the_command(checks, capsys, tmp_path):
     document = json.loads(out)
     jsonschema.validate(document, schema("verify"))
     assert code == 1 and document["failed"] == ["x"] and document["passed"] == 1
-    assert "failed: x" in passport.find(heavy).text and passport.find(paper_study()).failed == ()
+    assert "failed: x" in passport.find(heavy).text
+    assert passport.find(spec.paper_study()).failed == ()
     # whatever its title
     assert passport.find(heavy.model_copy(update={"title": "heavy"})).failed == ("x",)
 
@@ -500,7 +504,7 @@ def test_a_damaged_outcome_is_none(checks, capsys):
         "[" * 100_000,
     ):
         file.write_text(text)
-        assert passport.find(paper_study()) is None
+        assert passport.find(spec.paper_study()) is None
     file.unlink()
     os.mkfifo(file)
-    assert passport.find(paper_study()) is None
+    assert passport.find(spec.paper_study()) is None
