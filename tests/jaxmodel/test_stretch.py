@@ -206,7 +206,7 @@ def test_pairs_of_actuators_on_both_faces_do_not_lengthen_links():
 @pytest.mark.parametrize(("law", "published"), [("lqg", 13.1), ("observer", 9.9)])
 def test_laws_with_a_model_keep_their_margins(law, published):
     """Published: of laws that believe that links keep their length."""
-    study = study_of(control={"basis": "pinned_pinned", "law": law})
+    study = study_of(control=CONTROL | {"law": law})
     structure, case = build_structure(study), build_case(study)
     pose = np.array(study.motion.waypoints[0])
     ignorant = as_arrays(build_case(study.change(link__stretch=False)))
