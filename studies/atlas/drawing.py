@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from studies.show.figures import SERIES, SMALL, WIDTH, axes_or_new, styled
 from studies.show.skeleton import Skeleton, skeleton
+from studies.study.cases import has_stretch
 from studies.study.spec import Study
 
 #: Largest drawn deflection of a link, as a share of its length [1].
@@ -68,7 +69,7 @@ def mode_skeleton(study: Study, pose: np.ndarray, shape: np.ndarray) -> Skeleton
     Args:
         study: the machine.
         pose: at rest [m, m, rad], (n,) coordinates.
-        shape: of the mode over (X, q), (n + links x R,).
+        shape: of the mode over (X, q), (n + links x R,); elongations are not drawn.
     """
     n, length = study.n_pose, study.each_link(study.link.length).min()
     q = shape[n:].reshape(study.n_links, -1)
@@ -79,7 +80,8 @@ def mode_skeleton(study: Study, pose: np.ndarray, shape: np.ndarray) -> Skeleton
     )
     phases = np.array([0.0, 1.0, -1.0])
     moved = pose + factor * phases[:, None] * shape[:n]
-    return skeleton(study, moved, factor * phases[:, None, None] * q, 1.0)
+    bent = q[:, :-1] if has_stretch(study) else q
+    return skeleton(study, moved, factor * phases[:, None, None] * bent, 1.0)
 
 
 def draw_mode(parts: Skeleton, ax: Axes | None = None) -> Axes:

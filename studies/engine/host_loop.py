@@ -122,10 +122,11 @@ def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
         return f"drives ({hertz:.0f} Hz)"
     q, q_rate = np.abs(right[first:last].reshape(2, n, r))
     energy = (loop.omega * q) ** 2 + q_rate**2
-    modes, moving = _dominant(energy.sum(axis=0)), _dominant(energy.sum(axis=1))
+    by_order = energy.sum(axis=0)
+    modes, moving = _dominant(by_order[: loop.n_modes]), _dominant(energy.sum(axis=1))
     own = ", ".join(f"{loop.omega[moving, j].mean() / (2 * np.pi):.0f}" for j in modes)
     text = f"{_numbered('mode', modes)} of {_numbered('link', moving)} ({own} Hz)"
-    if loop.has_stretch and energy.sum(axis=0).argmax() == loop.n_modes:
+    if loop.has_stretch and by_order.argmax() == loop.n_modes:
         text = f"stretch of {_numbered('link', moving)}"
     if links > filters:
         return text

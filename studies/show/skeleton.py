@@ -31,7 +31,7 @@ class Skeleton(NamedTuple):
 
 
 def skeleton(study: Study, pose: np.ndarray, q: np.ndarray, exaggeration: float) -> Skeleton:
-    """Positions of the machine's parts, with exaggerated bending.
+    """Positions of the machine's parts, with exaggerated bending; links keep their length.
 
     Args:
         study: the machine.
@@ -39,7 +39,8 @@ def skeleton(study: Study, pose: np.ndarray, q: np.ndarray, exaggeration: float)
         q: modal coordinates of the plant [m], (T, n, R).
         exaggeration: factor on the bending [1].
     """
-    structure, case = check_run(study.change(link__modes=q.shape[-1], control__feedback="none"))
+    fields = {"link__modes": q.shape[-1], "link__stretch": False, "control__feedback": "none"}
+    structure, case = check_run(study.change(**fields))
     near, joint, link = (
         np.asarray(part)
         for part in _positions(structure._replace(n_steps=1), case, pose, q, exaggeration)

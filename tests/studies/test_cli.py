@@ -30,6 +30,7 @@ from studies.engine.modes import machine_modes
 from studies.study.files import READY
 from studies.study.margin import margin_in_db
 from studies.study.spec import load_study
+from studies.study.template import toml_text
 from tests import canonical
 from tests.bare import parse_study
 from tests.canonical import HOME, MACHINE
@@ -38,6 +39,8 @@ from tests.pages import TITLE, parsed, rendered, text_of
 
 HOME_PHI = HOME[2]
 SHORT = canonical.text_of(MACHINE)
+#: Bare links that keep their length.
+KEPT = {"basis": "pinned_pinned", "stretch": False}
 
 
 def run(capsys, *arguments):
@@ -220,28 +223,34 @@ def columns(document):
     return tuple(zip(*rows, strict=True))
 
 
-def test_modes_as_json_and_as_table(capsys):
+def test_modes_as_json_and_as_table(capsys, tmp_path):
     code, out, err = run(capsys, "modes", "--modes", 2, "--json")
     found = json.loads(out)
     assert (code, err) == (0, "")
     assert list(found) == ["format", "format_version", "modes", "units"]
     frequency, ratio, names = map(list, columns(found))
     moves = [f"drive, platform {x}, 100 %" for x in ("translates", "translates", "turns")]
-    assert names == [
+    assert names[:9] == [
         *moves,
         *(f"links 1 2 3, mode {k}, 100 %" for k in (1, 1, 1, 2, 2, 2)),
     ]
+    assert all(name.startswith("links 1 2 3 lengthen, ") for name in names[9:])
     drive, link = found["modes"][2], found["modes"][8]
     told = {"kind": "drive", "links": [], "order": None, "platform": "turns"}
     assert drive == drive | told and drive["share"] == pytest.approx(1, abs=5e-3)
     told = {"kind": "link", "links": [1, 2, 3], "order": 2, "platform": None}
     assert link == link | told and link["share"] == pytest.approx(1, abs=5e-3)
-    assert len(frequency) == len(ratio) == 3 + 3 * 2
+    told = {"kind": "stretch", "links": [1, 2, 3], "order": None, "platform": None}
+    assert all(x == x | told and x["share"] > 0.9 for x in found["modes"][9:])
+    assert len(frequency) == len(ratio) == 3 + 3 * (2 + 1)
     assert np.all(np.diff(frequency) >= 0)
-    assert ratio == [0.0] * 9
-    # the links vibrate near their pinned-pinned frequencies
+    np.testing.assert_allclose(ratio, 0.0, atol=1e-12)
+    # the links vibrate near the frequencies of bare pinned links
     assert np.all(np.abs(np.array(frequency[3:6]) / 114.39 - 1) < 0.01)
-    code, out, _ = run(capsys, "modes", "--modes", 2, "--kd", 60, "--damping", 0.01, "--locked")
+    kept = tmp_path / "kept.toml"
+    kept.write_text(toml_text({"link": KEPT}))
+    damped = ("--modes", 2, "--kd", 60, "--damping", 0.01, "--locked")
+    code, out, _ = run(capsys, "modes", kept, *damped)
     assert code == 0 and "damping ratio" in out and "114.388" in out and "0.01000" in out
     assert "links 1 2 3, mode 2, 100 %" in out
 
@@ -263,11 +272,15 @@ def test_modes_name_their_link():
     np.testing.assert_allclose([x.share for x in rigid.kinds[3:]], largest)
 
 
-@pytest.mark.parametrize("thickness", [UNLIKE["link"]["thickness"], 2e-3])
-def test_shares_of_modes_are_what_their_frequencies_gain_from_stiffness(thickness):
+@pytest.mark.parametrize(
+    ("thickness", "stretch"),
+    [(UNLIKE["link"]["thickness"], False), (2e-3, False), (UNLIKE["link"]["thickness"], True)],
+)
+def test_shares_of_modes_are_what_their_frequencies_gain_from_stiffness(thickness, stretch):
     """d ln f^2 / d ln k is the share of k in the potential energy; in groups of equal frequency."""
     step, study = 1e-4, parse_study(UNLIKE | {"metrics": {"residual_delay": 0.0}})
     study = study.change(link__thickness=thickness, drive__kd=0.0, drive__kp=2e4)
+    study = study.change(link__stretch=stretch, link__stretch_damping=0.0)
 
     def gained(**change):
         high, low = (
@@ -279,7 +292,9 @@ def test_shares_of_modes_are_what_their_frequencies_gain_from_stiffness(thicknes
     found = machine_modes(study)
     of_link = gained(link__stiffness_factor=lambda x: (1.0, 1.0 + x, 1.0))
     of_drive = gained(drive__kp=lambda x: 2e4 * (1 + x))
-    kinds = [slice(0, 3), slice(3, 6), slice(6, 9)] if thickness == 2e-3 else np.arange(9)
+    assert [x.kind for x in found.kinds[9:]] == ["stretch"] * 3 * stretch
+    alone = np.arange(9 + 3 * stretch)
+    kinds = [slice(0, 3), slice(3, 6), slice(6, 9)] if thickness == 2e-3 else alone
     for kind in kinds:
         share = found.link_share[kind][..., 1, :].sum(axis=-1)
         np.testing.assert_allclose(np.sum(of_link[kind]), np.sum(share), atol=2e-6)
@@ -295,14 +310,20 @@ def test_modes_at_another_pose_differ(capsys):
 
 
 def test_modes_of_a_study_are_those_of_its_own_machine(capsys, tmp_path):
-    """Patches, joint inertia and damping; a load changes the links' frequencies."""
-    out = run(capsys, "modes", "measured", "--locked", "--json")[1]
+    """Patches, joint inertia and damping; a load changes the links' frequencies.
+
+    Of links that keep their length: those that lengthen mix in the damping of their elongations.
+    """
+    measured, links = tmp_path / "measured.toml", "[link]\nstretch = false\n"
+    measured.write_text((READY / "measured.toml").read_text().replace("[link]\n", links))
+    out = run(capsys, "modes", measured, "--locked", "--json")[1]
     found, ratio, _ = columns(json.loads(out))
     frequency = np.array(found).reshape(-1, 3)
     np.testing.assert_allclose(frequency[:2, 0], [92.5, 240.2], atol=0.1)
     np.testing.assert_allclose(ratio, 0.01, rtol=1e-6)
     study = tmp_path / "loaded.toml"
-    study.write_text("[load]\nwrench = [20, 0, 0]\n[motion]\nmove_time = [0.1, 0.1, 0.1, 0.2]\n")
+    load = "[load]\nwrench = [20, 0, 0]\n[motion]\nmove_time = [0.1, 0.1, 0.1, 0.2]\n"
+    study.write_text(f'{links}basis = "pinned_pinned"\n{load}')
     out = run(capsys, "modes", study, "--kd", 0, "--pose", f"0,0,{np.pi / 6}", "--json")[1]
     np.testing.assert_allclose(
         columns(json.loads(out))[0][3:6], [108.19, 118.16, 118.47], rtol=2e-4
@@ -375,14 +396,17 @@ def ideal(gain):
             changed(control=ideal(1e6)),
             "control.gain_factor = 1.0; allowed: gains low enough for 200 plant steps per sample",
         ),
-        (changed(control=ideal(1e3), run={"substeps": 1}), "run.substeps = 1; allowed: "),
+        (
+            changed(link=KEPT, control=ideal(1e3), run={"substeps": 1}),
+            "run.substeps = 1; allowed: ",
+        ),
         (
             changed(electronics={"lowpass_ratio": [3.0, 11.0]}),
             "low-pass corners below half the sample rate, 5000 Hz; the highest of the 3 is at 1132",
         ),
         (changed(link={"length": 0.01}), "patches.actuator_length = 0.03; allowed: at"),
         (
-            changed(link={"thickness": 0.1, "youngs_modulus": 2e12, "density": 1.0}),
+            changed(link=KEPT | {"thickness": 0.1, "youngs_modulus": 2e12, "density": 1.0}),
             "link.modes = 3; allowed: modes up to 1.592e+05 Hz at electronics.sample_rate_hz",
         ),
         ("[patches]\ncenters = [0.05, 0.06, 0.15]", "so that no patches overlap [m]"),

@@ -16,6 +16,7 @@ from rich.console import Console
 from studies.atlas import (
     attribution,
     claims,
+    drawing,
     figures,
     findings,
     platform,
@@ -246,6 +247,29 @@ def test_map_at_home_is_that_of_the_machine(atlas):
     assert np.all(np.isfinite(chart.bending) == np.isfinite(chart.margin)[..., None])
     inside = chart.bending[np.isfinite(chart.bending)]
     assert inside.min() > 110 and inside.max() < 125
+
+
+def test_modes_of_links_that_lengthen_are_drawn_by_their_bending():
+    """Elongations come last and are left out: what is drawn is as of links that keep their length.
+
+    Three longitudinal modes come beside those of bending.
+    """
+    kept = small_study()
+    long = kept.change(link__stretch=True)
+    modes = [workspace.natural_modes_at(study, np.array([HOME])) for study in (kept, long)]
+    shape = modes[1].shape[0, :, 3].real
+    by_link = shape[3:].reshape(3, -1)
+    assert by_link.shape[1] == kept.link.modes + 1
+    bending = np.concatenate([shape[:3], by_link[:, :-1].ravel()])
+    one, other = (
+        drawing.mode_skeleton(study, np.array(HOME), x)
+        for study, x in ((kept, bending), (long, shape))
+    )
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
+    assert modes[1].frequency.shape[1] == modes[0].frequency.shape[1] + 3
+    share = modes[1].order_share[0, :, -1]
+    assert np.sum(share > 0.5) == 3
 
 
 def test_a_pose_out_of_reach_is_refused():
