@@ -22,7 +22,7 @@ from jaxmodel.electronics import Amplifier, design_amplifier, voltage_passage
 from jaxmodel.estimator import KINDS
 from jaxmodel.hysteresis import Hysteresis, design_hysteresis
 from jaxmodel.integrator import Exponential, exponential_step
-from jaxmodel.kinematics import close_chain
+from jaxmodel.kinematics import chain_status, close_chain
 from jaxmodel.laws import LAWS, is_modal, n_channels
 from jaxmodel.laws.contract import NominalModel, check_feedback
 from jaxmodel.laws.poles import is_unplaceable
@@ -150,7 +150,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         initial_q=_initial_coordinates(structure, case, bases, plant),
         sensor_condition=design.sensor_condition,
         actuator_condition=design.actuator_condition,
-        status=_static_status(structure, case, bases, design, split, step),
+        status=_static_status(structure, case, bases, plant, design, split, step),
     )
 
 
@@ -205,6 +205,17 @@ def oscillators(structure: Structure, case: Case, plant: Plant, omega: Array) ->
     held = decay[:, -1] * share
     zeta = jnp.concatenate([decay[:, :-1], held[:, None]], axis=1) / (2 * omega)
     return omega, zeta, (own**2 - square, held - decay[:, -1])
+
+
+def _stretching(case: Case, plant: Plant, omega: Array) -> Array:
+    """omega of the fastest longitudinal mode [rad/s]; 0 of a path that ends out of reach.
+
+    Args:
+        omega: of `oscillators`.
+    """
+    pose = jnp.asarray(case.path.waypoints[-1])
+    is_ok = chain_status(plant, close_chain(plant, pose, jnp.zeros_like(pose))) == status.OK
+    return jnp.where(is_ok, STRETCHING * jnp.max(omega[:, -1]), 0.0)
 
 
 def _exponential(
@@ -471,6 +482,7 @@ def _static_status(
     structure: Structure,
     case: Case,
     bases: Bases,
+    plant: Plant,
     design: ControllerDesign,
     split: tuple[Array, ...],
     step: Array,
@@ -482,7 +494,7 @@ def _static_status(
     )
     stiff = drive_rate(structure.drive, case) * step
     if structure.has_stretch:
-        stiff = jnp.maximum(stiff, STRETCHING * jnp.max(split[0][:, -1]) * step)
+        stiff = jnp.maximum(stiff, _stretching(case, plant, split[0]) * step)
     patches, windows, control = case.machine.patches, case.windows, case.control
     length = jnp.broadcast_to(case.machine.beam.length, (structure.n_links,))
     is_off, is_overlapping = placement_faults(patches, length)
@@ -550,8 +562,8 @@ def coupled_rate(structure: Structure, case: Case) -> Array:
     if structure.has_stretch:
         plant = _plant(structure, case, find_bases(structure, case).plant)
         modes = jnp.sqrt(plant.stiffness / plant.modal_mass[:, None])[:, :-1]
-        omega = oscillators(structure, case, plant, modes)[0][:, -1]
-        return STRETCHING * jnp.max(omega) * (COUPLED_STEP_LIMIT / STIFFNESS_LIMIT)
+        rate = _stretching(case, plant, oscillators(structure, case, plant, modes)[0])
+        return rate * (COUPLED_STEP_LIMIT / STIFFNESS_LIMIT)
     if BASES[structure.basis].is_on_chord:
         return jnp.zeros(())
     beam = case.machine.beam

@@ -42,7 +42,7 @@ from studies.space.table import build_table
 from studies.study.cases import build_structure
 from studies.sweeps.show import case_rows, margin_warning, ranked_cases
 from tests import TOP
-from tests.sweeps import FAST_MOVE, MIXED, narrow_blocks, small, small_spec
+from tests.sweeps import FAST_MOVE, HOME_PHI, MIXED, narrow_blocks, small, small_spec
 
 SILENT = Console(file=open(os.devnull, "w"))  # noqa: SIM115
 
@@ -274,6 +274,16 @@ def test_each_case_takes_the_plant_steps_that_it_takes_alone(tmp_path):
         found = run_study(alone, has_record=False, has_loop=False)
         assert found.structure.substeps == data["substeps"][case]
         assert deviation(found, design.stored)[0] < 1e-9
+
+
+def test_a_path_out_of_reach_needs_no_plant_steps(tmp_path):
+    """Of links that lengthen: longitudinal modes of a machine that cannot close mean nothing."""
+    cases = [{"motion.waypoints": [[0, 0, HOME_PHI], [0, y, HOME_PHI]]} for y in (0.002, 0.9)]
+    spec = small_spec({"method": "list", "cases": cases}, link={"modes": 3, "stretch": True})
+    run(spec, tmp_path / "s")
+    data = read_sweep(tmp_path / "s")
+    np.testing.assert_array_equal(data["status"], [status.OK, status.OUT_OF_REACH])
+    assert data["substeps"][0] == data["substeps"][1]
 
 
 def test_static_choices_make_groups():
