@@ -4,6 +4,7 @@ Most tests were made with them: what they test does not depend on patches, and t
 from closed forms and codes of such links. `tests/jaxmodel/test_stretch.py` has patches as they are.
 """
 
+from jaxmodel.mechanisms import MECHANISMS
 from studies.bench.works import BARE
 from studies.fitting import spec as fitting_spec
 from studies.space import spec as space_spec
@@ -16,7 +17,8 @@ def bare(data):
     """The data of a study, sweep, tuning or fit with defaults of bare links."""
     data = {name: dict(part) if isinstance(part, dict) else part for name, part in data.items()}
     machine = data.get("machine")
-    links = 2 if isinstance(machine, dict) and machine.get("kind") == "five_bar" else 3
+    kind = machine.get("kind") if isinstance(machine, dict) else None
+    links = MECHANISMS[kind].n_links if isinstance(kind, str) and kind in MECHANISMS else 3
     for name, value in BARE.items():
         section, field = name.split("__")
         part = data.setdefault(section, {})
