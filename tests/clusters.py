@@ -81,7 +81,7 @@ class Machines:
         self.trouble()
         self._start("dask_scheduler", "--port", "0", "--no-dashboard", "--no-show")
         deadline = time.monotonic() + 60
-        while not self.scheduler.exists() and time.monotonic() < deadline:
+        while not self._is_written() and time.monotonic() < deadline:
             time.sleep(0.05)
 
     def trouble(self, **asked):
@@ -104,6 +104,12 @@ class Machines:
                 with suppress(psutil.Error):
                     found += [child.pid] * ("spawn_main" in " ".join(child.cmdline()))
         return sorted(found)
+
+    def _is_written(self):
+        """Whether the scheduler has written its file: it exists before it has contents."""
+        with suppress(OSError, ValueError):
+            return bool(json.loads(self.scheduler.read_text()))
+        return False
 
     def _start(self, program, *options):
         command = [sys.executable, "-m", f"distributed.cli.{program}", *map(str, options)]
