@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxmodel.beam import BASES
 from studies.study.consistency import patch_centers
 
 if TYPE_CHECKING:
@@ -84,6 +85,24 @@ def _line(study: Study, i: int, with_patches: bool) -> tuple[np.ndarray, np.ndar
     skin = of(patches, "youngs_modulus") * piezo_width * piezo
     stiffness = laminate_stiffness(core, thickness, skin, piezo, below, above)
     return x, mass, stiffness * of(link, "stiffness_factor")
+
+
+def link_inertia(study: Study) -> np.ndarray:
+    """Mass [kg], first moment [kg m] and inertia [kg m2] of the links about joints B, (3, n).
+
+    With what the basis of the plant adds: patches, and rotary inertia at the joints.
+    """
+    basis, links = BASES[study.link.basis], []
+    for i in range(study.n_links):
+        x, line, _ = _line(study, i, basis.has_patches)
+        weight = np.full(x.size, x[1])
+        weight[[0, -1]] /= 2
+        links.append((line * weight) @ x[:, None] ** np.arange(3))
+    found = np.array(links).T
+    if basis.has_joints:
+        link = study.link
+        found[2] += study.each_link(link.joint_inertia_b) + study.each_link(link.joint_inertia_c)
+    return found
 
 
 def _stodola(x: np.ndarray, mass: np.ndarray, stiffness: np.ndarray, joint: np.ndarray) -> float:

@@ -17,6 +17,7 @@ from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import SliderError, drive_force
 from studies.errors import StudyError, field_error
 from studies.study.geometry import far_joints, machine_geometry
+from studies.study.held_link import link_inertia
 from studies.study.spec import AUTO, Study
 
 #: The field.
@@ -227,16 +228,11 @@ def rigid_machine(study: Study) -> tuple[np.ndarray, np.ndarray]:
     by_height = np.einsum("ij,ijk->ik", n, joint)
     turn = by_height / (length * cosine)[:, None]
     rates = np.einsum("ij,ijk->ik", u, joint) + (sine / cosine)[:, None] * by_height
-    mass = (
-        study.each_link(link.density)
-        * study.each_link(link.width)
-        * study.each_link(link.thickness)
-        * length
-    )
+    mass, moment, turning = link_inertia(study)
     carried = near_mass + mass
-    coupling = mass * length / 2 * sine
+    coupling = moment * sine
     inertia = np.einsum("i,ij,ik->jk", carried, rates, rates)
-    inertia += np.einsum("i,ij,ik->jk", mass * length**2 / 3, turn, turn)
+    inertia += np.einsum("i,ij,ik->jk", turning, turn, turn)
     mixed = np.einsum("i,ij,ik->jk", coupling, rates, turn)
     inertia += _platform(study, pose) - mixed - mixed.T
     return inertia, rates
