@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from studies.engine.executor import Executor
+from studies.engine.frame import frame_of
 from studies.engine.plan import chunk_cases, even_layout, plan_groups
+from studies.engine.preflight import check_run
 from studies.space.table import CaseTable
 from studies.study.files import READY, read_toml
 from studies.study.paths import field_value
@@ -27,6 +29,9 @@ WORK = ("sweep", "tune", "fit")
 OTHERS = {
     "models.toml": "compares models, without control",
 }
+#: Examples whose shaped move leaves less than one step of the converter, with control or without:
+#: no controller sees that. README, "A first run", says so of the paper's own move.
+UNSEEN = ("paper.toml",)
 FACTORS = (1.0, 0.5, 0.0)
 
 
@@ -214,5 +219,9 @@ def test_control_beats_no_control(residual, k):
     controlled = residual[k][:, list(study.control.links)]
     assert np.isfinite(residual[k]).all()
     left, half, free = controlled.max(axis=1)
+    if EXAMPLES[k][0] in UNSEEN:
+        step = frame_of(*check_run(study)).adc_step
+        assert max(left, half, free) < np.min(np.asarray(step)[list(study.control.links)])
+        return
     assert left < 0.9 * free
     assert half < 0.9 * free
