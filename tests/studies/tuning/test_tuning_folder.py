@@ -16,6 +16,7 @@ from studies.engine.runs import run_study
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.explore import explore_results
+from studies.space.spec import parse_sweep
 from studies.store import read_store
 from studies.study import spec as spec_module
 from studies.study.files import read_toml
@@ -34,7 +35,7 @@ from studies.tuning.optimise import begin, is_compatible
 from studies.tuning.report import TuneFindings, best_family, n_outside, rank_correlation, report
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import load_tuning
-from tests.bare import paper_study, parse_sweep, parse_tuning
+from tests.bare import paper_study, parse_tuning
 from tests.pages import about, parsed, text_of
 from tests.tunings import GAIN, SMALL, tuning
 
