@@ -354,9 +354,10 @@ _mechanics_at = kept_jit(static_argnums=0)(mechanics_at)
 def step_counts(needed: Any) -> np.ndarray:
     """Plant steps per sample to use when `needed` suffice: the next power of two.
 
-    Thus a sweep needs few programs, and a case uses the same steps in any sweep.
+    Thus a sweep needs few programs, and a case uses the same steps in any sweep. Where more than
+    `SUBSTEP_LIMIT` are needed, the case's own status says that they do not suffice.
     """
-    return 2 ** np.ceil(np.log2(np.maximum(needed, 1))).astype(int)
+    return 2 ** np.ceil(np.log2(np.clip(needed, 1, SUBSTEP_LIMIT))).astype(int)
 
 
 def _drive_substeps(study: Study, rate: float) -> int:
