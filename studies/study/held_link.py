@@ -97,7 +97,7 @@ def link_inertia(study: Study) -> np.ndarray:
         x, line, _ = _line(study, i, basis.has_patches)
         weight = np.full(x.size, x[1])
         weight[[0, -1]] /= 2
-        moments = (line * weight) @ x[:, None] ** np.arange(3)
+        moments = (line * weight) @ x[:, None] ** np.array([0, 1, 2])
         moments[2] -= moments[0] * x[1] ** 2 / 6  # by which trapezoids exceed a parabola
         links.append(moments)
     found = np.array(links).T

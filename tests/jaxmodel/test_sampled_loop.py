@@ -120,6 +120,7 @@ def around_finite_elements(structure, case):
     return closed_loop(structure, case, HOME_POSE)
 
 
+@pytest.mark.long  # in short: of links that lengthen, in test_stretch
 @pytest.mark.parametrize("name", TABLE)
 def test_loops_are_those_of_finite_elements(name, monkeypatch):
     """The controller around an independent plant; nothing is shared but how it is sampled."""
