@@ -142,8 +142,7 @@ def plant_response(structure: Structure, case: Case, loop: Loop, pose: Array) ->
         ]
         damping = damping + _by_ports(plant.damping[:, -1] / longer**2, own, own)
         stiffness = stiffness + _by_ports(plant.stiffness[:, -1] / longer**2, own, own)
-        modes = plant.stiffness.shape[1] - 1
-        parts = {x: getattr(plant, x)[:, :modes] for x in ("stiffness", "damping", "b", "c")}
+        parts = {x: getattr(plant, x)[:, :-1] for x in ("stiffness", "damping", "b", "c")}
         plant = plant._replace(stretch=None, **parts)
     mass = sum(_by_ports(*term) for term in terms)
     at_c, at_b, inertia = _from_chord(plant)
@@ -366,7 +365,7 @@ def plant_images(plant: PlantResponse, omega: Array, order: np.ndarray) -> Image
     entering = s2[each] * (onto @ through(plant.enter, act))  # (I, 3, P, K)
     stiffness = s2[at] * plant.mass + s[at] * plant.damping + plant.stiffness
     stiffness = stiffness - jnp.sum(taken[:, :, :n, :n], axis=1)
-    force, long = jnp.broadcast_to(plant.slide[:, :n], taken.shape[:2] + (n,)), None
+    force, long = jnp.broadcast_to(plant.slide[:, :n], (*taken.shape[:2], n)), None
     if plant.longer is not None:  # elongations follow the pose and their own forces
         mass, damping, spring = plant.longer
         row = s2[at] * mass + s[at] * damping + spring - taken[:, :, n]
@@ -391,9 +390,8 @@ def plant_images(plant: PlantResponse, omega: Array, order: np.ndarray) -> Image
             leaving = leaving[..., :n] - seen * share[:, :, None]
         leaving = _stacked(leaving) @ compliance  # (I, 3 m, p)
         by_force = leaving @ force + by_force
-        return (gain * driven)[at] * (_block_diagonal(own) + leaving @ entering), -(gain * held)[
-            at
-        ] * by_force
+        by_command = _block_diagonal(own) + leaving @ entering
+        return (gain * driven)[at] * by_command, -(gain * held)[at] * by_force
 
     sensed, disturbed = outputs(plant.sensor, plant.direct, plant.read, seen)
     bent, pushed = outputs(plant.deflection, jnp.zeros(()), None, jnp.ones_like(s))

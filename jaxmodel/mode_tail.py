@@ -131,7 +131,7 @@ def _one_image(
 ) -> Array | None:
     """What is left out of one image over a span of |omega|, (U, U)."""
     at = _suprema(loop, *span, stiffness)
-    seen = high * (at.remainder if loop.exact is not None else at.answer)
+    seen = high * _direct_answer(loop, at)
     part = _through_pose(sizes, unknown, at, *span, stiffness, high if is_near else None)
     if part is None:
         return None
@@ -139,6 +139,11 @@ def _one_image(
         seen = seen + (1 - high) * at.answer
         part = part + _static_rest(loop, int(np.sum(high == 0)))
     return _chain(loop, span[0]) * (part + _direct(sizes, seen))
+
+
+def _direct_answer(loop: ModalLoop, at: _Band) -> Array:
+    """What a mode that is left out does directly, beyond its static correction if there is one."""
+    return at.remainder if loop.exact is not None else at.answer
 
 
 def _first_image(
@@ -151,7 +156,7 @@ def _first_image(
 ) -> Array:
     """Direct answers at image 0 over a span of omega, where hold and filters are at most 1."""
     at = _suprema(loop, *span, stiffness)
-    seen = high * (at.remainder if loop.exact is not None else at.answer)
+    seen = high * _direct_answer(loop, at)
     x = np.asarray(span[1] / unknown.omega / unknown.known**2 / np.sqrt(stiffness[0]))
     distance, size = _remainder(loop, unknown, x, stiffness)
     compliance = np.einsum("ik,il->ikl", unknown.sense, unknown.pull) / unknown.known

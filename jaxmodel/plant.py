@@ -98,6 +98,7 @@ def build_plant(
     inertia = masses.platform_inertia + jnp.asarray(masses.payload_inertia)
     if offset is not None:
         inertia = inertia + payload * jnp.sum(jnp.asarray(offset) ** 2)
+    modes = basis
     if stretch is not None:
         basis = lengthening(basis, stretch)
     plant = Plant(
@@ -119,8 +120,8 @@ def build_plant(
         * damping_ratio(machine.damping, jnp.sqrt(basis.stiffness / basis.mass))
         * jnp.sqrt(basis.stiffness * basis.mass),
         tip=basis.tip,
-        shortening=basis.shortening if has_shortening else None,
-        mixed_shortening=basis.mixed_shortening if has_shortening else None,
+        shortening=modes.shortening if has_shortening else None,
+        mixed_shortening=modes.mixed_shortening if has_shortening else None,
         inward=unlumped(basis, length) if has_shortening and is_distributed else None,
         centrifugal=basis.centrifugal if has_shortening and is_distributed else None,
         b=basis.b,
@@ -129,13 +130,8 @@ def build_plant(
     )
     if stretch is None or basis.stretch is None:
         return plant
-    return plant._replace(
-        shortening=None if plant.shortening is None else plant.shortening[:, :-1],
-        mixed_shortening=None
-        if plant.mixed_shortening is None
-        else plant.mixed_shortening[:, :-1, :-1],
-        damping=plant.damping.at[:, -1].set(basis.stretch**2 * stretch.damping),
-    )
+    along = basis.stretch**2 * stretch.damping
+    return plant._replace(damping=plant.damping.at[:, -1].set(along))
 
 
 def lengthening(basis: ModalBasis, stretch: Stretch) -> ModalBasis:

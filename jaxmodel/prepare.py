@@ -92,7 +92,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
     bases = find_bases(structure, case)
     basis = bases.plant
     stretch = stretch_of(structure, case)
-    plant = _plant(structure, case, basis)
+    plant = _plant(structure, case, basis, stretch)
     design = design_controller(structure, case, bases)
     omega = jnp.sqrt(basis.stiffness / basis.mass)
     split = oscillators(structure, case, plant, omega)
@@ -161,14 +161,14 @@ def _beside(x: Array, value: Array, axis: int) -> Array:
     return jnp.concatenate([x, last], axis=axis)
 
 
-def _plant(structure: Structure, case: Case, basis: ModalBasis) -> Plant:
+def _plant(structure: Structure, case: Case, basis: ModalBasis, stretch: Stretch | None) -> Plant:
     return build_plant(
         case.machine,
         basis,
         case.drive.is_locked,
         structure.has_shortening,
         structure.is_distributed,
-        stretch_of(structure, case),
+        stretch,
     )
 
 
@@ -560,7 +560,8 @@ def coupled_rate(structure: Structure, case: Case) -> Array:
     `STIFFNESS_LIMIT`.
     """
     if structure.has_stretch:
-        plant = _plant(structure, case, find_bases(structure, case).plant)
+        basis = find_bases(structure, case).plant
+        plant = _plant(structure, case, basis, stretch_of(structure, case))
         modes = jnp.sqrt(plant.stiffness / plant.modal_mass[:, None])[:, :-1]
         rate = _stretching(case, plant, oscillators(structure, case, plant, modes)[0])
         return rate * (COUPLED_STEP_LIMIT / STIFFNESS_LIMIT)

@@ -125,9 +125,7 @@ class LoopGains(NamedTuple):
             share = row[..., :p] / row[..., p:]
             heard = leaving[..., p] + plant.read[:, :, None] / w2
             pushed = entering[..., p] + plant.push[:, :, None] / w2
-            dynamic = dynamic - np.swapaxes(share, 1, 2).swapaxes(2, 3) @ np.swapaxes(
-                row[..., :p], 1, 2
-            )
+            dynamic = dynamic - np.einsum("nlfp,nlfq->nfpq", share, row[..., :p])
             own = own + (heard * w2 * w2 / row[..., p:])[..., None] * pushed[..., None, :]
             leaving, entering = (
                 x[..., :p] - y[..., None] * share[..., None, :]

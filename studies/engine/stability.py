@@ -263,7 +263,9 @@ def _figures(
         if not has_motion:
             return figures, None
         if plain.has_stretch:
-            by_stretch = {x: margin(all_loops(_stretching(case, x)).at_rest) for x in DAMPINGS}
+            others = [x for x in DAMPINGS if np.any(case.machine.damping.stretch != x)]
+            by_stretch = dict.fromkeys(DAMPINGS, float(figures.gain_margin))
+            by_stretch |= {x: margin(all_loops(_stretching(case, x)).at_rest) for x in others}
             figures = figures._replace(by_stretch=by_stretch)
         _, instants = np.unique(loops.time, return_index=True)
         margins = [margin(loops.in_motion, k) for k in instants]

@@ -201,9 +201,9 @@ def _origin(exported: FixedController, case_id: str) -> list[str]:
     wiring = []
     if study.patches.actuators == "both faces":
         wiring = [
-            "Each actuator is a pair, one patch on each face, wired with opposite polarity to"
+            "Each actuator is a pair, one patch on each face, wired with opposite polarity to",
+            "one amplifier, which has twice the capacitance to drive",
         ]
-        wiring += ["one amplifier, which has twice the capacitance to drive"]
     return [
         f"{study.title}",
         f"Exported by {package}; study SHA-256 {study_hash(study)}"
