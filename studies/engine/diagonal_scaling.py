@@ -9,8 +9,8 @@ import numpy as np
 
 #: Sweeps that balance rows against columns.
 SWEEPS = 3
-#: Distance of gamma from sigma^2, as a share of it: first, in the second round, last, its factor.
-FIRST, LATER, LAST, SHRINK = 0.1, 3e-3, 1e-5, 0.3
+#: Distance of gamma from sigma^2, as a share of it: first, last, its factor.
+FIRST, LAST, SHRINK = 0.1, 1e-5, 0.3
 #: Newton decrement below which gamma may fall, steps at most, and the largest |ln D|.
 CENTRED, STEPS, WIDEST = 0.7, 40, 25.0
 
@@ -44,22 +44,18 @@ def _balance(matrix: np.ndarray) -> np.ndarray:
     return np.clip(log - log.mean(axis=1, keepdims=True), -WIDEST, WIDEST)
 
 
-def best_scaling(
-    matrix: np.ndarray, start: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def best_scaling(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Least norms of D M D^-1 to 1e-4, from above, and ln D; see `jaxmodel.scaling`.
 
     Args:
         matrix: M, (N, m, m).
-        start: ln D near the best, (N, m); None: balanced.
 
     Returns:
         (N,), (N, m).
     """
-    n, m = matrix.shape[:2]
-    x = _balance(matrix) if start is None else start
-    distance = np.full(n, FIRST if start is None else LATER)
-    least, best = np.full(n, np.inf), x
+    x = _balance(matrix)
+    distance = np.full(len(x), FIRST)
+    least, best = np.full(len(x), np.inf), x
     for _ in range(STEPS):
         a = matrix * np.exp(x[:, :, None] - x[:, None])
         power = np.conj(np.swapaxes(a, 1, 2)) @ a

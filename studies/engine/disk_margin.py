@@ -62,7 +62,7 @@ def _peaks(loops: LoopGains, bracket: np.ndarray, is_fine: bool) -> tuple[np.nda
         scale = np.exp(log[:, :, None] - log[:, None])
         for _ in range(2):
             bracket, _ = _zoomed(loops, bracket, scale, is_fine)
-        found, log = best_scaling(excess(loops.exact(bracket[:, 1:2])[:, 0]), log)
+        found, log = best_scaling(excess(loops.exact(bracket[:, 1:2])[:, 0]))
     return found, bracket[:, 1]
 
 

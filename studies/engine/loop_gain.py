@@ -22,10 +22,11 @@ from jaxmodel.frequency_response import (
     tail_weights,
 )
 from jaxmodel.notch import notch_response
+from jaxmodel.return_difference import FAR
 from jaxmodel.return_difference import IMAGES as FEW
 from jaxmodel.state_space import StateSpace
 
-_FEW, _ALL = np.array(FEW), np.arange(-IMAGES, IMAGES + 1)
+_FEW, _FAR, _ALL = np.array(FEW), np.array(FAR), np.arange(-IMAGES, IMAGES + 1)
 #: Evaluations of the plant at once, which stay in a processor's cache.
 AT_ONCE = 1500
 
@@ -97,17 +98,32 @@ class LoopGains(NamedTuple):
     def _evaluated(self, omega: np.ndarray, delay: np.ndarray, order: np.ndarray) -> np.ndarray:
         plant = self.plant
         period = plant.period[:, None]
-        late = (1.0 if plant.delay is None else plant.delay[:, None]) + delay
-        gain = _image_weights(late, order) * np.exp(-1j * omega * period * late)[..., None]
-        w = omega[..., None] + 2 * np.pi / period[..., None] * order  # (n, F, I)
+        w, gain = self._chain(omega, delay, order)
         flat = w.reshape(len(w), -1)
-        gain = (gain * _electronics(plant, omega, w)).reshape(flat.shape)
-        sensed = self._sensed(flat, gain, len(order))
+        direct: Any = 0.0
+        if order is _FEW:  # of farther images only what is direct counts
+            far = np.sum(self._chain(omega, delay, _FAR)[1], axis=-1)
+            direct = far[:, None, :, None, None] * plant.direct[:, :, None]
+        sensed = self._sensed(flat, gain.reshape(flat.shape), len(order), direct)
         feedback = _feedback(self.controller, np.exp(1j * omega * period))
         return -feedback[..., self.acting, :] @ sensed
 
-    def _sensed(self, w: np.ndarray, gain: np.ndarray, images: int) -> np.ndarray:
-        """Sensor volts per command, see `plant_images`; images summed, (n, F, l K, m)."""
+    def _chain(
+        self, omega: np.ndarray, delay: np.ndarray, order: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Frequencies of images and their weights through delay and electronics, (n, F, I)."""
+        plant, period = self.plant, self.plant.period[:, None]
+        late = (1.0 if plant.delay is None else plant.delay[:, None]) + delay
+        gain = _image_weights(late, order) * np.exp(-1j * omega * period * late)[..., None]
+        w = omega[..., None] + 2 * np.pi / period[..., None] * order
+        return w, gain * _electronics(plant, omega, w)
+
+    def _sensed(self, w: np.ndarray, gain: np.ndarray, images: int, far: Any) -> np.ndarray:
+        """Sensor volts per command, see `plant_images`; images summed, (n, F, l K, m).
+
+        Args:
+            far: what is added to each link's own channels, (n, l, F, K, K).
+        """
         plant, n = self.plant, len(w)
         (links, k), p = plant.sensor.shape[1:3], plant.mass.shape[-1]
         square = w * w
@@ -139,7 +155,7 @@ class LoopGains(NamedTuple):
         left = leaving.transpose(0, 1, 3, 2, 4).reshape(n, -1, links * k, p * images)
         sensed = left @ entering[..., self.acting].reshape(n, -1, p * images, len(self.acting))
         own = gain[:, None, :, None, None] * own
-        own = own.reshape(n, links, -1, images, k, k).sum(axis=3)
+        own = own.reshape(n, links, -1, images, k, k).sum(axis=3) + far
         whole = np.zeros((*sensed.shape[:3], links * k), complex)
         for i in range(links):
             rows = slice(i * k, (i + 1) * k)
