@@ -96,16 +96,14 @@ class LoopGains(NamedTuple):
         )
 
     def _evaluated(self, omega: np.ndarray, delay: np.ndarray, order: np.ndarray) -> np.ndarray:
-        plant = self.plant
-        period = plant.period[:, None]
         w, gain = self._chain(omega, delay, order)
         flat = w.reshape(len(w), -1)
         direct: Any = 0.0
         if order is _FEW:  # of farther images only what is direct counts
             far = np.sum(self._chain(omega, delay, _FAR)[1], axis=-1)
-            direct = far[:, None, :, None, None] * plant.direct[:, :, None]
+            direct = far[:, None, :, None, None] * self.plant.direct[:, :, None]
         sensed = self._sensed(flat, gain.reshape(flat.shape), len(order), direct)
-        feedback = _feedback(self.controller, np.exp(1j * omega * period))
+        feedback = _feedback(self.controller, np.exp(1j * omega * self.plant.period[:, None]))
         return -feedback[..., self.acting, :] @ sensed
 
     def _chain(
@@ -119,11 +117,8 @@ class LoopGains(NamedTuple):
         return w, gain * _electronics(plant, omega, w)
 
     def _sensed(self, w: np.ndarray, gain: np.ndarray, images: int, far: Any) -> np.ndarray:
-        """Sensor volts per command, see `plant_images`; images summed, (n, F, l K, m).
-
-        Args:
-            far: what is added to each link's own channels, (n, l, F, K, K).
-        """
+        """Sensor volts per command, see `plant_images`; images summed, `far` added to each
+        link's own channels, (n, F, l K, m)."""
         plant, n = self.plant, len(w)
         (links, k), p = plant.sensor.shape[1:3], plant.mass.shape[-1]
         square = w * w
