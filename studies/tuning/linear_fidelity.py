@@ -21,7 +21,7 @@ from jaxmodel.parameters import Array
 from studies.engine.plan import padded_rows
 from studies.engine.robustness import find_margins
 from studies.errors import StudyError
-from studies.study.cases import in_working_precision
+from studies.study.cases import build_structure, in_working_precision
 from studies.study.numbers import Numbers, stack_numbers, study_numbers
 from studies.threads import serial_blas
 from studies.tuning.loop_figures import (
@@ -199,9 +199,10 @@ class LinearFidelity:
             return np.zeros(len(values)), np.zeros(len(values))
         quick = [k for k, name in enumerate(self.names) if name not in (*MARGINS, *PEAKS)]
         names = tuple(self.names[k] for k in quick) or ("slowest_decay",)
+        steps = build_structure(self._spec.study).n_steps  # the command's, as a run has them
         evaluate = partial(
             screen_designs,
-            batch.structure,
+            batch.structure._replace(n_steps=steps),
             names,
             self._spec.free.place,
             jax.tree.map(lambda x: x[0], batch.of_design(position)),

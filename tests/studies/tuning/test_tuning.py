@@ -16,6 +16,7 @@ from studies.engine.runs import run_study
 from studies.errors import StudyError
 from studies.space.axes import Range
 from studies.space.free import Free, FreeNumbers
+from studies.study.cases import build_structure
 from studies.tuning import linear_fidelity, loop_figures, loop_programs
 from studies.tuning.check import tuned_study
 from studies.tuning.evaluate import Evaluation
@@ -233,6 +234,7 @@ def screened():
 
     def known(structure, names, place, numbers, limits, links, values):
         assert names == tuple(JUDGED["limits"])[1:] and len(values) == BATCH
+        assert structure.n_steps == build_structure(tuning(FREE, **JUDGED).study).n_steps
         seen.extend(values)
         residual = np.where(values[:, 1] < 2, np.nan, values[:, 1])
         return values[:, :1] * 0.1 / limits - 1, residual
@@ -269,6 +271,10 @@ def test_a_screen_says_what_an_evaluation_does():
     beyond, residual = linear.screen(1, values[:1])
     np.testing.assert_allclose(beyond[0], linear.evaluate(values).limits[1].max(), rtol=1e-9)
     assert np.isfinite(residual).all()
+    own = linear.screen(1, spec.free.values(spec.free.places())[None])[1]
+    run = run_study(spec.study, has_record=False).result.metrics.residual_rms
+    counted = np.asarray(run)[np.array(spec.counted_links)]
+    np.testing.assert_allclose(own, np.sqrt(np.mean(counted**2)), rtol=0.3)
 
 
 @pytest.mark.usefixtures("screened")
