@@ -91,34 +91,26 @@ def sensor_capacitance(patches: Patches) -> Array:
 def sensor_constant(beam: Beam, patches: Patches) -> Array:
     """lambda_s [V/rad] of (15): voltage per slope difference over the sensor.
 
-    Of a piezo patch, open-circuit, lambda_s = b_p E_p |d31| z_s/C with z_s = (t_b + t_p)/2, since
-    the actuator covers the other face, and the clamped capacitance C; of a strain gauge, see
-    `gauge_constant`.
+    `sensor_gain` times the sensor's distance z_s from the neutral axis: (t_b + t_p)/2 of a piezo
+    patch, since the actuator covers the other face; of a strain gauge t_b/2 + z_n, where z_n is the
+    shift of the neutral axis towards the actuator on the other face.
     """
-    charge = actuator_force(patches) * (beam.thickness + patches.thickness) / 2
-    piezo = charge / sensor_capacitance(patches)
-    return jnp.where(jnp.asarray(patches.is_gauge) > 0, gauge_constant(beam, patches), piezo)
-
-
-def gauge_constant(beam: Beam, patches: Patches) -> Array:
-    """lambda_s [V/rad] of a strain gauge: amplified bridge voltage per slope difference over it.
-
-    Its mean strain is (t_b/2 + z_n)/l_g times the difference of slope over its length l_g; z_n is
-    the shift of the neutral axis towards the actuator on the other face. With gauge factor k,
-    excitation U, n active arms of four and gain g, V = U g (n/4) k strain (Hoffmann 1989).
-    """
-    return patches.bridge * patches.gauge_factor * _gauge_arm(beam, patches) / patches.sensor_length
-
-
-def _gauge_arm(beam: Beam, patches: Patches) -> Array:
-    shift = one_sided_section(beam, patches).neutral_axis * (1 - patches.is_paired)
-    return beam.thickness / 2 + shift
-
-
-def sensor_arm(beam: Beam, patches: Patches) -> Array:
-    """Distance of a sensor from the section's neutral axis [m], see `sensor_constant`."""
     piezo = (beam.thickness + patches.thickness) / 2
-    return jnp.where(jnp.asarray(patches.is_gauge) > 0, _gauge_arm(beam, patches), piezo)
+    shift = one_sided_section(beam, patches).neutral_axis * (1 - patches.is_paired)
+    is_gauge = jnp.asarray(patches.is_gauge) > 0
+    return sensor_gain(patches) * jnp.where(is_gauge, beam.thickness / 2 + shift, piezo)
+
+
+def sensor_gain(patches: Patches) -> Array:
+    """Voltage of a sensor per length by which it is drawn out [V/m].
+
+    Of a piezo patch, open-circuit, b_p E_p |d31|/C with the clamped capacitance C. Of a strain
+    gauge of length l_g, gauge factor k, excitation U, n active arms of four and gain g,
+    U g (n/4) k/l_g (Hoffmann 1989).
+    """
+    gauge = patches.bridge * patches.gauge_factor / patches.sensor_length
+    piezo = actuator_force(patches) / sensor_capacitance(patches)
+    return jnp.where(jnp.asarray(patches.is_gauge) > 0, gauge, piezo)
 
 
 def patch_ends(center: Array, length: Array) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxmodel.beam import by_link
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array, Beam, Damping, Patches
-from jaxmodel.piezo import actuator_force, sensor_arm, sensor_constant
+from jaxmodel.piezo import actuator_force, sensor_gain
 from jaxmodel.static import Pieces, link_pieces, patch_count, section_mass
 
 #: Frequency at which `Damping.stretch` is the ratio of a longitudinal mode [rad/s].
@@ -66,8 +66,8 @@ def find_stretch(beam: Beam, patches: Patches, damping: Damping, has_patches: bo
         end = jnp.cumsum(soft) / compliance
         start = end - soft / compliance
         line_mass = section_mass(beam, patches, pieces, has_patches)
-        force, volts = actuator_force(patches), sensor_constant(beam, patches)
-        volts = -volts / sensor_arm(beam, patches)
+        # what draws a sensor out bends it the other way: it reads against the bending
+        force, volts = actuator_force(patches), -sensor_gain(patches)
         return (
             1 / compliance,
             jnp.sum(line_mass * width * (start**2 + start * end + end**2)) / 3,

@@ -15,7 +15,8 @@ from jaxmodel.stretch import find_stretch, held_voltage
 from studies.engine.margins import judge_loops
 from studies.engine.stability import gain_margin, loop_report, with_margin_modes
 from studies.study.cases import as_arrays, build_case, build_structure
-from studies.study.spec import parse_study
+from studies.study.files import READY
+from studies.study.spec import load_study, parse_study
 from tests import DATA
 from tests.elements import plant_of_elements
 
@@ -74,6 +75,18 @@ def test_batches_judge_loops_as_eigenvalues_do(kind):
     batch = judge_loops(structure, jax.tree.map(lambda x: np.asarray(x)[None], case))
     np.testing.assert_allclose(batch.gain_margin, wanted.gain_margin, rtol=1e-3)
     np.testing.assert_allclose(batch.least_damping[0], wanted.damping_ratio.min(axis=1), rtol=1e-3)
+
+
+def test_lower_filters_leave_longitudinal_modes_alone():
+    """The ready-made design has what its first lines say, where the default has half of it."""
+    found = []
+    for study in (load_study(READY / "filtered.toml"), parse_study({})):
+        pose = np.array(study.motion.waypoints[0])
+        found.append(loop_report(build_structure(study), build_case(study), pose))
+    margin, default = (x.gain_margin for x in found)
+    np.testing.assert_allclose((margin, default), (3.84, 2.10), rtol=3e-3)
+    damping = [x.damping_ratio[0].min() for x in found]
+    np.testing.assert_allclose(damping, (0.227, 0.123), rtol=5e-3)
 
 
 def finite_elements():

@@ -171,8 +171,8 @@ FAULTS = {
     ),
     "stretch read with bending": Fault(
         "jaxmodel/stretch.py",
-        "volts = -volts / sensor_arm(beam, patches)",
-        "volts = volts / sensor_arm(beam, patches)",
+        "force, volts = actuator_force(patches), -sensor_gain(patches)",
+        "force, volts = actuator_force(patches), sensor_gain(patches)",
         "links and patches",
         is_bare=False,
     ),
