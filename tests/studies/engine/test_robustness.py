@@ -142,7 +142,7 @@ def test_the_search_uses_the_same_response(name, law):
         late = np.full((1, len(omega)), delay)
         np.testing.assert_allclose(gains.exact(omega[None], late)[0], wanted, atol=1e-12 * scale)
         found = gains.at_delay(omega[None], late)[0]
-        np.testing.assert_allclose(found, wanted, atol=3e-4 * scale)
+        np.testing.assert_allclose(found, wanted, atol=1e-4 * scale)
 
 
 _closed = jax.jit(close_loop)
