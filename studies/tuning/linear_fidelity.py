@@ -92,16 +92,15 @@ class LinearFidelity:
     def _batch(self, families: list[Family], rows: np.ndarray) -> _Batch:
         spec, chosen = self._spec, [families[k] for k in rows]
         parts = spec.parts(chosen[0])
-        structure = judged_structure(
-            spec, nominal(spec, None if parts == spec.parts() else chosen[0])
-        )
+        study = nominal(spec, None if parts == spec.parts() else chosen[0])
+        structure = judged_structure(spec, study)
         of_family = {
             name: self._on_machines(family, structure)
             for name, family in {family.name: family for family in chosen}.items()
         }
         numbers = stack_numbers([of_family[family.name] for family in chosen])
         numbers = in_working_precision(numbers)
-        return _Batch(rows, structure, numbers)
+        return _Batch(rows, structure, build_structure(study).n_steps, numbers)
 
     def _on_machines(self, family: Family, structure: Structure) -> Numbers:
         study = with_margin_modes(family.study(self._spec.study))
@@ -199,10 +198,9 @@ class LinearFidelity:
             return np.zeros(len(values)), np.zeros(len(values))
         quick = [k for k, name in enumerate(self.names) if name not in (*MARGINS, *PEAKS)]
         names = tuple(self.names[k] for k in quick) or ("slowest_decay",)
-        steps = build_structure(self._spec.study).n_steps  # the command's, as a run has them
         evaluate = partial(
             screen_designs,
-            batch.structure._replace(n_steps=steps),
+            batch.structure._replace(n_steps=batch.n_steps),
             names,
             self._spec.free.place,
             jax.tree.map(lambda x: x[0], batch.of_design(position)),
@@ -302,7 +300,8 @@ class _Batch(NamedTuple):
     """Designs of one law and drive."""
 
     rows: np.ndarray  # places among all designs, rising
-    structure: Structure
+    structure: Structure  # of the loop alone
+    n_steps: int  # samples of the command, as a run has them
     numbers: Numbers  # leaves (designs, machines, ...)
 
     def of_design(self, position: int) -> Numbers:
