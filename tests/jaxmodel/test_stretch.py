@@ -43,11 +43,14 @@ def study_of(basis="loaded", stretch=True, damping=0.01, kind="prrr", control=CO
     return parse_study({"machine": {"kind": kind}, "link": link, "control": control})
 
 
+def judged(study, law=None):
+    pose = np.array(study.motion.waypoints[0])
+    return loop_report(build_structure(study), build_case(study), pose, law=law)
+
+
 @cache
 def report_of(*arguments):
-    study = study_of(*arguments)
-    pose = np.array(study.motion.waypoints[0])
-    return loop_report(build_structure(study), build_case(study), pose)
+    return judged(study_of(*arguments))
 
 
 @pytest.mark.parametrize(
@@ -71,7 +74,7 @@ def test_margins_and_damping_are_those_of_two_independent_codes(machine):
 def test_batches_judge_loops_as_eigenvalues_do(kind):
     study = study_of(kind=kind)
     structure, case = build_structure(study), build_case(study)
-    wanted = loop_report(structure, case, np.array(study.motion.waypoints[0]))
+    wanted = judged(study)
     batch = judge_loops(structure, jax.tree.map(lambda x: np.asarray(x)[None], case))
     np.testing.assert_allclose(batch.gain_margin, wanted.gain_margin, rtol=1e-3)
     np.testing.assert_allclose(batch.least_damping[0], wanted.damping_ratio.min(axis=1), rtol=1e-3)
@@ -79,10 +82,7 @@ def test_batches_judge_loops_as_eigenvalues_do(kind):
 
 def test_lower_filters_leave_longitudinal_modes_alone():
     """The ready-made design has what its first lines say, where the default has half of it."""
-    found = []
-    for study in (load_study(READY / "filtered.toml"), parse_study({})):
-        pose = np.array(study.motion.waypoints[0])
-        found.append(loop_report(build_structure(study), build_case(study), pose))
+    found = [judged(x) for x in (load_study(READY / "filtered.toml"), parse_study({}))]
     margin, default = (x.gain_margin for x in found)
     np.testing.assert_allclose((margin, default), (3.84, 2.10), rtol=3e-3)
     damping = [x.damping_ratio[0].min() for x in found]
@@ -121,9 +121,7 @@ def test_a_controller_around_finite_elements_has_its_published_margin(monkeypatc
     mine = study_of(modes=12, youngs_modulus=68.3e9, damping_ratio=0.012)
     mine = mine.change(load__mass=0.12)
     law = prepare(structure, case).loop.controller
-    found = loop_report(
-        build_structure(mine), build_case(mine), np.array(mine.motion.waypoints[0]), law=law
-    )
+    found = judged(mine, law)
     np.testing.assert_allclose(found.gain_margin, margin, rtol=0.03)
     # static volts per volt, all patches
     static = modes["S"] @ (modes["B"] / modes["w2"][:, None]) + modes["res"]
@@ -210,12 +208,7 @@ def test_pairs_of_actuators_on_both_faces_do_not_lengthen_links():
     )
     assert np.all(np.asarray(stretch.free) > 0) and not np.any(paired.free)
     assert not np.any(held_voltage(paired)) and np.any(held_voltage(stretch))
-    margins = [report_of().gain_margin]
-    margins.append(
-        loop_report(
-            build_structure(both), build_case(both), np.array(both.motion.waypoints[0])
-        ).gain_margin
-    )
+    margins = [report_of().gain_margin, judged(both).gain_margin]
     assert margins[1] > 1.3 * margins[0]
 
 
@@ -225,9 +218,7 @@ def test_pairs_of_actuators_on_both_faces_do_not_lengthen_links():
 def test_laws_with_a_model_keep_their_margins(law, published):
     """Published: of laws that believe that links keep their length."""
     study = study_of(control=CONTROL | {"law": law})
-    structure, case = build_structure(study), build_case(study)
-    pose = np.array(study.motion.waypoints[0])
-    ignorant = as_arrays(build_case(study.change(link__stretch=False)))
-    believed = prepare(structure._replace(has_stretch=False), ignorant).loop.controller
-    report = loop_report(structure, case, pose, law=believed)
+    ignorant = study.change(link__stretch=False)
+    believed = prepare(build_structure(ignorant), as_arrays(build_case(ignorant))).loop.controller
+    report = judged(study, believed)
     np.testing.assert_allclose(report.gain_margin, published, rtol=5e-3)

@@ -60,7 +60,7 @@ PLANTS: dict[str, dict[str, Any]] = {
     },
     "no reaction of bending": {"run__model": "ked"},
 }
-#: The last one in long tests: in short in test_margins.
+#: The last one in long tests alone.
 CASES = [
     pytest.param(name, "imsc", id=name, marks=[pytest.mark.long] * ("no reaction" in name))
     for name in PLANTS
