@@ -111,4 +111,5 @@ def _first_modes(basis: ModalBasis, n_modes: int) -> ModalBasis:
         deflection_at=basis.deflection_at[:, :, :n],
         sensor_slope=basis.sensor_slope[:, :n],
         actuator_slope=basis.actuator_slope[:, :n],
+        end_slope=basis.end_slope[:, :n],
     )

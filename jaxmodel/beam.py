@@ -58,6 +58,7 @@ class ModalBasis(NamedTuple):
     deflection_at: Array  # Y_j at `stations` minus the chord's (x/L) Y_j(L) [1], (3, S, R)
     sensor_slope: Array  # Phi_s: Y_j' at right minus left sensor end [1/m], (3, R, n_patches)
     actuator_slope: Array  # Phi_a: the same for the actuators [1/m], (3, R, n_patches)
+    end_slope: Array  # Y_j' at both ends [1/m], (3, R, 2)
     # exact static response to moments of the actuators, whatever the modes (`jaxmodel.static`)
     static_slope: Array  # slope differences over the sensors [rad/(N m)], (3, n_patches, n_patches)
     static_deflection: Array  # from the chord at `stations` [m/(N m)], (3, S, n_patches)
@@ -140,6 +141,7 @@ def mask_modes(basis: ModalBasis, mode_mask: Array) -> ModalBasis:
         deflection_at=basis.deflection_at * mask,
         sensor_slope=basis.sensor_slope * mask[:, None],
         actuator_slope=basis.actuator_slope * mask[:, None],
+        end_slope=basis.end_slope * mask[:, None],
     )
 
 
@@ -203,6 +205,10 @@ def _slope_difference(slope: Callable[[Array], Array], patches: Patches, length:
     return slope(right) - slope(left)
 
 
+def _ends(beam: Beam) -> Array:
+    return jnp.stack([jnp.zeros_like(beam.length), beam.length])
+
+
 def _pinned_pinned(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> ModalBasis:
     order = jnp.arange(1, n_modes + 1)
     wave = order * np.pi / beam.length
@@ -230,6 +236,7 @@ def _pinned_pinned(beam: Beam, patches: Patches, n_modes: int, stations: Array) 
         deflection_at=jnp.sin(wave * stations[:, None]),
         sensor_slope=_slope_difference(slope, patches, patches.sensor_length),
         actuator_slope=_slope_difference(slope, patches, patches.actuator_length),
+        end_slope=slope(_ends(beam)),
         static_slope=slopes,
         static_deflection=bent,
     )
@@ -282,6 +289,7 @@ def _pinned_free(beam: Beam, patches: Patches, n_modes: int, stations: Array) ->
         deflection_at=jax.vmap(shape)(stations) - (stations / beam.length)[:, None],
         sensor_slope=_slope_difference(slope, patches, patches.sensor_length),
         actuator_slope=_slope_difference(slope, patches, patches.actuator_length),
+        end_slope=slope(_ends(beam)),
         static_slope=slopes,
         static_deflection=bent,
     )
@@ -422,6 +430,7 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
         * _slope_difference(
             slope, patches, jnp.minimum(patches.sensor_length, patches.actuator_length)
         ),
+        end_slope=(ends @ coefficient).T,
         static_slope=slopes,
         static_deflection=bent,
     )

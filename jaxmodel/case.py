@@ -43,6 +43,7 @@ class Structure(NamedTuple):
     has_hysteresis: bool = False  # of the actuators, near their voltage limit
     has_noise: bool = False  # seeded ADC noise and force ripple
     has_friction: bool = False  # Coulomb friction of the drives
+    has_joint_friction: bool = False  # pin joints rub
     has_poles: bool = False  # gains follow from poles
     has_position_gain: bool = True  # feedback of modal positions, not of velocities alone
     metrics: tuple[str, ...] = ()  # to accumulate; (): all of them

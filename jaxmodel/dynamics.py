@@ -109,6 +109,7 @@ def accelerations(
     piezo: Array,
     wrench: Array | None = None,
     is_coupled: bool = True,
+    torque: Array | None = None,
 ) -> Accelerations:
     """Accelerations of pose and modes, (7) solved.
 
@@ -123,6 +124,7 @@ def accelerations(
         wrench: force and moment on the platform at its reference point [N, N, N m], (3,), or None.
         is_coupled: False: kineto-elastodynamics in two passes (static): the machine moves as if its
             links were rigid, motion and axial forces bend the links, and nothing acts back.
+        torque: on the links [N m], (3,), or None.
 
     Returns:
         Accelerations.
@@ -144,6 +146,8 @@ def accelerations(
         link = _link(plant, chain, swing, q, q_rate, pull, slider_force)
         if spread is not None:
             link = _spread_out(plant, chain, spread, link, q, q_rate, pull)
+        if torque is not None:
+            link = link._replace(load_g=link.load_g - torque)
         joint = _joint(chain, link)
         if not _is_rigid(plant):
             end, joint = _release_end(plant, chain, joint, q, pull, spread)

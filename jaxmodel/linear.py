@@ -87,6 +87,8 @@ def linearise(
     Returns:
         LinearPlant.
     """
+    # friction counts as nothing here: it damps small motion most, the safe side
+    loop = loop._replace(plant=loop.plant._replace(joint_friction=None))
     pose = jnp.asarray(pose, loop.omega.dtype)
     still = jnp.zeros_like(pose)
     rate = still if moment is None else jnp.asarray(moment.rate, pose.dtype)

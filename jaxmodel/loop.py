@@ -14,20 +14,14 @@ from jaxmodel import metrics, status
 from jaxmodel.actuation import Acting, act, acting_now
 from jaxmodel.axial import stretch_error
 from jaxmodel.case import Drive, Structure
-from jaxmodel.controller import (
-    Controller,
-    ControllerState,
-    controller_step,
-    rest_controller,
-    soft_limit,
-)
+from jaxmodel.controller import Controller, ControllerState, controller_step, soft_limit
 from jaxmodel.drive import Reference, drive_step, motor_force, slider_force
-from jaxmodel.drives import DRIVES
-from jaxmodel.drives.contract import DriveState, resting_drive
+from jaxmodel.drives.contract import DriveState
 from jaxmodel.dynamics import Accelerations, accelerations, modal_chain, shortening_row
 from jaxmodel.electronics import Amplifier
 from jaxmodel.hysteresis import Hysteresis
 from jaxmodel.integrator import Exponential
+from jaxmodel.joints import joint_forces
 from jaxmodel.kinematics import Chain, chain_status, close_chain
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
@@ -194,7 +188,14 @@ def plant_rates(
     force = slider_force(structure, loop.drive, reference, chain.rho, chain.rho_rate)
     if structure.feedback == "ideal":
         voltage = ideal_voltage(structure, loop, state.q, state.q_rate)
-    piezo = jnp.sum(loop.actuator * voltage[:, None], axis=2)
+    piezo, torque = jnp.sum(loop.actuator * voltage[:, None], axis=2), None
+    wrench = reference.wrench
+    if loop.plant.joint_friction is not None:
+        rubbing = joint_forces(loop.plant, chain, state.pose_rate, state.q_rate)
+        piezo = piezo + rubbing[2]
+        if structure.is_coupled:
+            force, torque = force + rubbing[0], rubbing[1]
+            wrench = rubbing[3] if wrench is None else wrench + rubbing[3]
     rates = accelerations(
         loop.plant,
         chain,
@@ -203,8 +204,9 @@ def plant_rates(
         state.q_rate,
         force,
         piezo,
-        reference.wrench,
+        wrench,
         structure.is_coupled,
+        torque,
     )
     return Rates(chain, rates)
 
@@ -665,69 +667,3 @@ def _freeze_if_bad(
     return chosen._replace(
         status=kept, bad_time=jnp.where(is_first, inputs.window.time, old.bad_time)
     )
-
-
-def initial_state(
-    structure: Structure, loop: Loop, pose: Array, q: Array, code: Array, highpass: Array
-) -> State:
-    """State at rest at a pose with given modal coordinates.
-
-    Args:
-        structure: static choices.
-        loop: constants, only for sizes.
-        pose: (3,).
-        q: [m], (3, R); the electronics start settled on it.
-        code: status known before the run, as a float, ().
-        highpass: corner of the patches into their amplifiers [rad/s], (); 0: not drained.
-
-    Returns:
-        State.
-    """
-    zero, still = jnp.zeros_like(q), jnp.zeros_like(pose)
-    is_sampled = structure.feedback == "sampled"
-    is_drained = is_sampled and structure.has_sensor_highpass
-    drained = jnp.where(highpass > 0, q, zero)
-    controller = rest_controller(loop.controller)
-    is_direct = is_sampled and loop.left_out is not None
-    n_stations = loop.deflection_at.shape[1]
-    sizes = metrics.Sizes(
-        n_stations=n_stations,
-        n_modes=structure.n_modes,
-        n_controlled=structure.n_controlled,
-        n_frequencies=structure.n_frequencies,
-        n_links=structure.n_links,
-        n_pose=structure.n_pose,
-    )
-    totals = metrics.zero_totals(sizes, q.dtype, structure.metrics)
-    return State(
-        plant=PlantState(
-            pose,
-            still,
-            q,
-            zero,
-            z=(q - drained if is_drained else q) if is_sampled else None,
-            z_rate=zero if is_sampled else None,
-            s=drained if is_drained else None,
-            voltage=controller.voltage if is_sampled and structure.has_amplifier else None,
-            direct_z=jnp.zeros_like(controller.voltage) if is_direct else None,
-            direct_z_rate=jnp.zeros_like(controller.voltage) if is_direct else None,
-            direct_s=jnp.zeros_like(controller.voltage) if is_direct and is_drained else None,
-            commands=None if loop.delayed is None else _on_their_way(loop.delayed, controller),
-            plays=None if loop.hysteresis is None else _no_plays(loop.hysteresis, controller),
-        ),
-        controller=controller,
-        totals=totals,
-        status=code,
-        bad_time=jnp.zeros_like(code),
-        drive=resting_drive(DRIVES[structure.drive], still),
-    )
-
-
-def _on_their_way(delayed: Delayed, controller: ControllerState) -> Array:
-    """Commands before the start, all zero [V], (J - 2, 3, K)."""
-    return jnp.stack([jnp.zeros_like(controller.voltage)] * (delayed.before.shape[0] - 2))
-
-
-def _no_plays(hysteresis: Hysteresis, controller: ControllerState) -> Array:
-    """Actuators that nothing has driven before [V], (N, 3, K)."""
-    return jnp.stack([jnp.zeros_like(controller.voltage)] * hysteresis.play.shape[0])

@@ -84,6 +84,8 @@ class Machine(NamedTuple):
     beam: Beam
     patches: Patches
     damping: Damping
+    joint_friction: Array = 0.0  # T, Coulomb torque at both joints of a link [N m], ()
+    joint_friction_speed: Array = 0.02  # of its tanh [rad/s], ()
 
     @property
     def n_links(self) -> int:

@@ -45,6 +45,9 @@ class Plant(NamedTuple):
     c: Array  # [kg m], (3, R)
     # elongation of a link per last coordinate, which is no mode [1], (3,); None: no such one
     stretch: Array | None = None
+    # of joints that rub: T [N m] and speed of its tanh [rad/s], () each, slopes of the coordinates
+    # at the near and the far end [1/m], (3, R) each; None: they do not
+    joint_friction: tuple[Array, Array, Array, Array] | None = None
 
 
 def damping_ratio(damping: Damping, omega: Array) -> Array:
@@ -67,6 +70,7 @@ def build_plant(
     has_shortening: bool = True,
     is_distributed: bool = False,
     stretch: Stretch | None = None,
+    has_joint_friction: bool = False,
 ) -> Plant:
     """Collect machine and basis into a `Plant`.
 
@@ -81,6 +85,7 @@ def build_plant(
         is_distributed: every point of a bent link moves inwards by its own amount (static); False:
             half of the link moves in with joint C.
         stretch: of the links; None: they keep their length.
+        has_joint_friction: joints rub (static).
 
     Returns:
         Plant.
@@ -101,6 +106,7 @@ def build_plant(
     modes = basis
     if stretch is not None:
         basis = lengthening(basis, stretch)
+    rubbing = machine.joint_friction, machine.joint_friction_speed
     plant = Plant(
         legs=legs,
         joint_cos=None if arms is None else arms[0],
@@ -127,6 +133,9 @@ def build_plant(
         b=basis.b,
         c=basis.c,
         stretch=basis.stretch,
+        joint_friction=(*rubbing, *jnp.moveaxis(basis.end_slope, 2, 0))
+        if has_joint_friction
+        else None,
     )
     if stretch is None or basis.stretch is None:
         return plant
@@ -159,6 +168,7 @@ def lengthening(basis: ModalBasis, stretch: Stretch) -> ModalBasis:
         b=beside(basis.b),
         c=beside(basis.c),
         stretch=scale,
+        end_slope=jnp.pad(basis.end_slope, ((0, 0), (0, 1), (0, 0))),
     )
 
 

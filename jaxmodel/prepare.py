@@ -22,6 +22,7 @@ from jaxmodel.electronics import Amplifier, design_amplifier, voltage_passage
 from jaxmodel.estimator import KINDS
 from jaxmodel.hysteresis import Hysteresis, design_hysteresis
 from jaxmodel.integrator import Exponential, exponential_step
+from jaxmodel.joints import joint_decay
 from jaxmodel.kinematics import chain_status, close_chain
 from jaxmodel.laws import LAWS, is_modal, n_channels
 from jaxmodel.laws.contract import NominalModel, check_feedback
@@ -169,6 +170,8 @@ def _plant(structure: Structure, case: Case, basis: ModalBasis, stretch: Stretch
         structure.has_shortening,
         structure.is_distributed,
         stretch,
+        # linear models leave it out: it damps small motion most, so they are on the safe side
+        structure.has_joint_friction and not structure.is_linear,
     )
 
 
@@ -207,15 +210,21 @@ def oscillators(structure: Structure, case: Case, plant: Plant, omega: Array) ->
     return omega, zeta, (own**2 - square, held - decay[:, -1])
 
 
-def _stretching(case: Case, plant: Plant, omega: Array) -> Array:
-    """omega of the fastest longitudinal mode [rad/s]; 0 of a path that ends out of reach.
+def _explicit_rate(structure: Structure, case: Case, plant: Plant, omega: Array) -> Array:
+    """Fastest motion of the links that plant steps do not solve exactly [1/s], ().
+
+    The fastest longitudinal mode, 0 of a path that ends out of reach, and friction in the joints.
 
     Args:
         omega: of `oscillators`.
     """
+    if not structure.has_stretch:
+        return joint_decay(plant)
     pose = jnp.asarray(case.path.waypoints[-1])
     is_ok = chain_status(plant, close_chain(plant, pose, jnp.zeros_like(pose))) == status.OK
-    return jnp.where(is_ok, STRETCHING * jnp.max(omega[:, -1]), 0.0)
+    return jnp.maximum(
+        joint_decay(plant), jnp.where(is_ok, STRETCHING * jnp.max(omega[:, -1]), 0.0)
+    )
 
 
 def _exponential(
@@ -493,8 +502,7 @@ def _static_status(
         jnp.where(is_used, x[:, : structure.n_modes], 0.0) for x in (split[0] * step, split[1])
     )
     stiff = drive_rate(structure.drive, case) * step
-    if structure.has_stretch:
-        stiff = jnp.maximum(stiff, _stretching(case, plant, split[0]) * step)
+    stiff = jnp.maximum(stiff, _explicit_rate(structure, case, plant, split[0]) * step)
     patches, windows, control = case.machine.patches, case.windows, case.control
     length = jnp.broadcast_to(case.machine.beam.length, (structure.n_links,))
     is_off, is_overlapping = placement_faults(patches, length)
@@ -556,21 +564,22 @@ def coupled_rate(structure: Structure, case: Case) -> Array:
     """omega of the fastest motion that `COUPLED_STEP_LIMIT` bounds [rad/s], 0: there is none.
 
     The highest mode of links whose ends are not on their chords, of pinned-free links
-    sqrt(E I/(rhoA L^4)) (kL)^2; or a share of the fastest longitudinal mode, whose limit is
-    `STIFFNESS_LIMIT`.
+    sqrt(E I/(rhoA L^4)) (kL)^2; or a share of `_explicit_rate`, whose limit is `STIFFNESS_LIMIT`.
     """
-    if structure.has_stretch:
+    rate = jnp.zeros(())
+    if structure.has_stretch or structure.has_joint_friction:
         basis = find_bases(structure, case).plant
         plant = _plant(structure, case, basis, stretch_of(structure, case))
-        modes = jnp.sqrt(plant.stiffness / plant.modal_mass[:, None])[:, :-1]
-        rate = _stretching(case, plant, oscillators(structure, case, plant, modes)[0])
-        return rate * (COUPLED_STEP_LIMIT / STIFFNESS_LIMIT)
+        omega = jnp.sqrt(basis.stiffness / basis.mass)
+        rate = _explicit_rate(
+            structure, case, plant, oscillators(structure, case, plant, omega)[0]
+        ) * (COUPLED_STEP_LIMIT / STIFFNESS_LIMIT)
     if BASES[structure.basis].is_on_chord:
-        return jnp.zeros(())
+        return rate
     beam = case.machine.beam
     line_mass = beam.density * beam.width * beam.thickness
     root = jnp.sqrt(bare_stiffness(beam) * beam.stiffness_factor / line_mass) / beam.length**2
-    return jnp.max(root) * pinned_free_roots(structure.n_modes)[-1] ** 2
+    return jnp.maximum(rate, jnp.max(root) * pinned_free_roots(structure.n_modes)[-1] ** 2)
 
 
 def _is_ill_conditioned(structure: Structure, case: Case, design: ControllerDesign) -> Array:

@@ -14,9 +14,10 @@ from jaxmodel.case import Case, Load, Structure
 from jaxmodel.delay import command_change, true_delay
 from jaxmodel.drives import DRIVES
 from jaxmodel.dynamics import inverse_dynamics, with_platform
+from jaxmodel.initial import initial_state
 from jaxmodel.kinematics import inverse_kinematics, path_status, singularity_distance
 from jaxmodel.lazy import compiled, jax, jnp
-from jaxmodel.loop import Inputs, Loop, Record, State, initial_state, step
+from jaxmodel.loop import Inputs, Loop, Record, State, step
 from jaxmodel.motion import end_of_path, shape_path
 from jaxmodel.parameters import Array
 from jaxmodel.plant import Plant

@@ -61,7 +61,7 @@ REASONS = {
     WINDOW_TOO_LONG: "residual window longer than the run or shorter than a sample",
     TOO_FAST: "a filter, shaper or plant mode too fast for the step",
     STATION_OFF_LINK: "station off the link",
-    TOO_STIFF: "drive or ideal feedback too stiff for the step",
+    TOO_STIFF: "drive, joints or ideal feedback too stiff for the step",
     CLIPPED: "ADC clipped too often",
     BUCKLED: "steady load on a link beyond its critical force",
     MOTORS_SATURATED: "motors saturated too often",

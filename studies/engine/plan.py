@@ -216,7 +216,8 @@ def _plant_steps(
     needed = np.maximum(np.ceil(rate * period / STIFFNESS_LIMIT), 1)
     written = int(table.values("run.substeps")[members[0]])
     is_too_stiff = needed > (written or SUBSTEP_LIMIT)
-    if structure.has_stretch or not BASES[structure.basis].is_on_chord:
+    is_explicit = structure.has_stretch or structure.has_joint_friction
+    if is_explicit or not BASES[structure.basis].is_on_chord:
         coupled = _of_cases(table, structure, members, _COUPLED, partial(_coupled_rate, structure))
         needed = np.maximum(needed, np.ceil(coupled * period / COUPLED_STEP_LIMIT))
     counts = np.full(len(members), written) if written else step_counts(needed)

@@ -133,6 +133,7 @@ def _without_run(structure: Structure) -> Structure:
         "has_static_correction",
         "is_coupled",
         "has_wrench",
+        "has_joint_friction",
         "controller_basis",
         "law",
         "drive",

@@ -50,6 +50,7 @@ SWITCHES = {
     "has_hysteresis": ("patches.hysteresis",),
     "has_noise": ("electronics.adc_noise", "drive.ripple", "patches.gauge_noise"),
     "has_friction": ("drive.coulomb_friction",),
+    "has_joint_friction": ("machine.joint_friction",),
     "has_poles": ("control.damping", "control.pole_decay"),
     "has_position_gain": ("control.position_gain", "control.damping", "control.pole_decay"),
 }
@@ -243,6 +244,8 @@ def _machine(numbers: Numbers, structure: Structure, xp: Any) -> Machine:
             is_paired=1.0 * number("patches.actuators"),
         ),
         damping=_damping(numbers, xp),
+        joint_friction=number("machine.joint_friction"),
+        joint_friction_speed=number("machine.joint_friction_speed"),
     )
 
 

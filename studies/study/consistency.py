@@ -101,7 +101,8 @@ def check_mechanism(study: Study) -> None:
     """
     mechanism, machine = study.mechanism, study.machine
     solid = {"platform_inertia"} if mechanism.n_pose == 3 else set()
-    read = {"kind", "kinds", "platform_mass", *solid, *mechanism.reads}
+    joints = {"joint_friction", "joint_friction_speed"}
+    read = {"kind", "kinds", "platform_mass", *joints, *solid, *mechanism.reads}
     default = defaults_of(type(study), mechanism, "machine")
     for leaf, value in machine:
         if leaf not in read and value != default[leaf]:

@@ -175,6 +175,7 @@ _RULES: tuple[Rule, ...] = (
     ("patches.sensor", ("piezo",), ("patches.gauge_",)),
     ("patches.sensor", ("strain_gauge",), ("electronics.sensor_highpass_hz",)),
     ("drive.coulomb_friction", (0.0,), ("drive.friction_speed",)),
+    ("machine.joint_friction", (0.0,), ("machine.joint_friction_speed",)),
 )
 
 

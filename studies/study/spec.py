@@ -147,6 +147,15 @@ class MachineSection(Section):
     slider_mass: EachLink[Annotated[float, Field(ge=1e-3, le=1e3)]] = described(
         0.15, "kg", "m_s of each slider", free=DESIGN
     )
+    joint_friction: float = described(
+        0.0,
+        "N m",
+        "T of T tanh(omega/omega_0) at both joints of each link; small ball bearings 5e-5 to 5e-4",
+        ge=0,
+        le=1,
+        free=MACHINE,
+    )
+    joint_friction_speed: float = described(0.02, "rad/s", "omega_0", gt=0, le=10)
 
 
 class MotionSection(Section):

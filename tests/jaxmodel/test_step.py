@@ -4,7 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from jaxmodel.loop import initial_state, step
+from jaxmodel.initial import initial_state
+from jaxmodel.loop import step
 from jaxmodel.prepare import prepare
 from jaxmodel.simulate import command
 from studies.study.cases import as_arrays, build_case, build_structure
