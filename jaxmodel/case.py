@@ -13,6 +13,9 @@ from jaxmodel.motion import Path
 from jaxmodel.parameters import Array, Machine
 from jaxmodel.state_space import StateSpace
 
+#: States of a motor that follows late.
+MOTOR_ORDER = 3
+
 
 class Structure(NamedTuple):
     """Static and hashable: array sizes and the few choices that change the program."""
@@ -44,6 +47,7 @@ class Structure(NamedTuple):
     has_noise: bool = False  # seeded ADC noise and force ripple
     has_friction: bool = False  # Coulomb friction of the drives
     has_joint_friction: bool = False  # pin joints rub
+    has_drive_lag: bool = False  # motors follow their commands late
     has_poles: bool = False  # gains follow from poles
     has_position_gain: bool = True  # feedback of modal positions, not of velocities alone
     metrics: tuple[str, ...] = ()  # to accumulate; (): all of them
@@ -64,6 +68,11 @@ class Structure(NamedTuple):
     def n_coordinates(self) -> int:
         """Coordinates of a link: its modes, and its elongation if it has one."""
         return self.n_modes + self.has_stretch
+
+    @property
+    def n_motors(self) -> int:
+        """States of motors that follow late."""
+        return MOTOR_ORDER * self.n_links * self.has_drive_lag
 
     @property
     def n_sensors(self) -> int:
@@ -146,6 +155,7 @@ class Drive(NamedTuple):
     coulomb_friction: Array  # [N]
     friction_speed: Array  # speed of the tanh [m/s]
     viscous_friction: Array  # [N s/m]
+    lag: Array  # dead time from a command to the motors' force [s], ()
     ripple: Array  # seeded force ripple, rms [N]
     pulse_force: Array  # disturbance [N], (3,)
     pulse_start: Array  # [s], ()

@@ -51,16 +51,49 @@ def _error(reference: Reference, rho: Array, rho_rate: Array) -> SliderError:
     return SliderError(reference.rho - rho, reference.rho_rate - rho_rate)
 
 
+#: Dead time tau by the Pade approximant (2, 3) of exp(-s tau), 1e-4 up to omega tau = 1.5: force F
+#: and two more states x' = LAG (x, u)/tau, which a held command u brings to u.
+LAG = ((-9.0, 6.0, 0.0, 3.0), (-6.0, 0.0, 10.0, -4.0), (-1.0, 0.0, 0.0, 1.0))
+#: Fastest pole of the states, times tau [1].
+LAG_POLE = 4.1
+#: Of the idle states of motors without lag in a batch with others [s].
+_IDLE = 0.01
+
+
+def late_force(drive: Drive, command: Array, motor: Array | None) -> tuple[Array, Array | None]:
+    """Force of motors that follow their commands late [N], (n,), and rate of their states [N/s].
+
+    Args:
+        drive: its numbers.
+        command: from `motor_force` [N], (n,).
+        motor: states of the motors [N], (3, n); None: they follow at once.
+    """
+    if motor is None:
+        return command, None
+    is_late = drive.lag > 0
+    rates = jnp.stack(
+        [sum(c * x for c, x in zip(row, (*motor, command), strict=True)) for row in LAG]
+    )
+    return jnp.where(is_late, motor[0], command), rates / jnp.where(is_late, drive.lag, _IDLE)
+
+
+def late_response(s: Array, lag: Array) -> Array:
+    """Force over command at s [1/s], the same approximant [1], complex."""
+    x = s * lag
+    return (60 - 24 * x + 3 * x * x) / (60 + x * (36 + x * (9 + x)))
+
+
 def slider_force(
-    structure: Structure, drive: Drive, reference: Reference, rho: Array, rho_rate: Array
+    structure: Structure, drive: Drive, reference: Reference, motors: Array, rho_rate: Array
 ) -> Array:
     """Force on the joints [N], (n,): motors, friction F_c tanh(rho'/v) + c rho', disturbance.
 
     Args:
-        structure, drive, reference, rho, rho_rate: as in `motor_force`; tanh is costly, so Coulomb
+        structure, drive, reference, rho_rate: as in `motor_force`; tanh is costly, so Coulomb
             friction is left out where the structure has none.
+        motors: from `late_force` [N], (n,).
     """
-    force = motor_force(structure, drive, reference, rho, rho_rate) + reference.disturbance
+    force = motors + reference.disturbance
     force = force - drive.viscous_friction * rho_rate
     if structure.has_friction:
         force = force - drive.coulomb_friction * jnp.tanh(rho_rate / drive.friction_speed)

@@ -21,6 +21,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.controller import Controller
 from jaxmodel.delay import LONGEST, command_change, true_delay
+from jaxmodel.drive import late_response
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import drive_gains
 from jaxmodel.dynamics import mass_matrix, platform_mass
@@ -67,6 +68,9 @@ class PlantResponse(NamedTuple):
     deflection: Array  # from the chord at the stations per modal coordinate, (3, S, R)
     direct_deflection: Array  # the same per actuator volt by modes that are left out, (3, S, K)
     slide: Array  # of the actuated joints per motion of the pose, (3, P)
+    # of motors that follow late: position and rate gains of their drives [N/m] and [N s/m], (3,)
+    # each, which damping and stiffness have as if they did not, and lag [s], (); None: they do not
+    servo: tuple[Array, Array, Array] | None
     period: Array  # T [s], ()
     antialias: Array  # [rad/s], ()
     highpass: Array | None  # of the patches [rad/s], None if there is none, ()
@@ -185,6 +189,7 @@ def plant_response(structure: Structure, case: Case, loop: Loop, pose: Array) ->
         deflection=deflection,
         direct_deflection=jnp.zeros(shape, mass.dtype) if left_out is None else left_out.deflection,
         slide=to_rho,
+        servo=(*gains, drive.lag) if structure.has_drive_lag else None,
         period=jnp.asarray(electronics.period),
         antialias=jnp.asarray(electronics.antialias),
         highpass=electronics.sensor_highpass if structure.has_sensor_highpass else None,
@@ -248,6 +253,22 @@ def _normal_modes(
         jnp.einsum("ijr,irs,iks->ijk", half, stiffness / mass[:, None], half)
     )
     return square, jnp.einsum("ikr,iks->irs", half, shape)
+
+
+def late_stiffness(plant: Any, s: Array) -> Array:
+    """Dynamic stiffness of the ports by motors that follow late, less that of prompt ones.
+
+    Args:
+        plant: a `PlantResponse` with `servo`; leaves may have leading axes.
+        s: [1/s], (.., N).
+
+    Returns:
+        (.., 3, N, P, P).
+    """
+    (position, rate, lag), slide = plant.servo, plant.slide
+    gap = late_response(s, lag[..., None]) - 1
+    force = (position[..., None] + rate[..., None] * s[..., None, :]) * gap[..., None, :]
+    return force[..., None, None] * (slide[..., None, :, None] * slide[..., None, None, :])
 
 
 class Assembled(NamedTuple):
@@ -362,6 +383,8 @@ def plant_images(plant: PlantResponse, omega: Array, order: np.ndarray) -> Image
     at, each, n = (slice(None), None, None), (slice(None), None, None, None), len(plant.mass)
     onto, port = jnp.swapaxes(plant.port, 1, 2), plant.port
     taken = (s2 * s2)[each] * (onto @ through(plant.enter, plant.leave) @ port)  # (I, 3, P, P)
+    if plant.servo is not None:
+        taken = taken - jnp.swapaxes(late_stiffness(plant, s), 0, 1)
     entering = s2[each] * (onto @ through(plant.enter, act))  # (I, 3, P, K)
     stiffness = s2[at] * plant.mass + s[at] * plant.damping + plant.stiffness
     stiffness = stiffness - jnp.sum(taken[:, :, :n, :n], axis=1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from jaxmodel import metrics
-from jaxmodel.case import Structure
+from jaxmodel.case import MOTOR_ORDER, Structure
 from jaxmodel.controller import ControllerState, rest_controller
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import resting_drive
@@ -14,7 +14,13 @@ from jaxmodel.parameters import Array
 
 
 def initial_state(
-    structure: Structure, loop: Loop, pose: Array, q: Array, code: Array, highpass: Array
+    structure: Structure,
+    loop: Loop,
+    pose: Array,
+    q: Array,
+    code: Array,
+    highpass: Array,
+    force: Array | None,
 ) -> State:
     """State at rest at a pose with given modal coordinates.
 
@@ -25,6 +31,7 @@ def initial_state(
         q: [m], (3, R); the electronics start settled on it.
         code: status known before the run, as a float, ().
         highpass: corner of the patches into their amplifiers [rad/s], (); 0: not drained.
+        force: of the motors at rest [N], (3,); None: none.
 
     Returns:
         State.
@@ -59,6 +66,7 @@ def initial_state(
             direct_z_rate=jnp.zeros_like(controller.voltage) if is_direct else None,
             direct_s=jnp.zeros_like(controller.voltage) if is_direct and is_drained else None,
             commands=None if loop.delayed is None else _on_their_way(loop.delayed, controller),
+            motor=_settled_motors(structure, still if force is None else force),
             plays=None if loop.hysteresis is None else _no_plays(loop.hysteresis, controller),
         ),
         controller=controller,
@@ -77,3 +85,7 @@ def _on_their_way(delayed: Delayed, controller: ControllerState) -> Array:
 def _no_plays(hysteresis: Hysteresis, controller: ControllerState) -> Array:
     """Actuators that nothing has driven before [V], (N, 3, K)."""
     return jnp.stack([jnp.zeros_like(controller.voltage)] * hysteresis.play.shape[0])
+
+
+def _settled_motors(structure: Structure, force: Array) -> Array | None:
+    return jnp.stack([force] * MOTOR_ORDER) if structure.has_drive_lag else None

@@ -33,27 +33,37 @@ def joint_rates(plant: Plant, chain: Chain, pose_rate: Array, q_rate: Array) -> 
     return near, far
 
 
-def joint_forces(
-    plant: Plant, chain: Chain, pose_rate: Array, q_rate: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Generalised forces of the joints' friction; arguments as for `joint_rates`.
+def rub(
+    plant: Plant,
+    chain: Chain,
+    rates: tuple[Array, Array],
+    force: Array,
+    piezo: Array,
+    wrench: Array | None,
+) -> tuple[Array, Array, Array | None, Array]:
+    """Forces as `accelerations` takes them, with those of the joints' friction.
+
+    Args:
+        plant: the machine, with `joint_friction`.
+        chain: closure at this state.
+        rates: of pose and modal coordinates, (3,) and (3, R).
+        force: on the actuated joints [N], (3,).
+        piezo: on the modes over the modal mass [m/s2], (3, R).
+        wrench: on the platform [N, N, N m], (3,), or None.
 
     Returns:
-        on the actuated joints [N], on the links' angles [N m], (3,) each; on the modes over the
-        modal mass [m/s2], (3, R); and on the platform [N, N, N m], (3,).
+        force, piezo and wrench, and the torques on the links [N m], (3,).
     """
     assert plant.joint_friction is not None
     torque, speed, at_near, at_far = plant.joint_friction
-    near, far = (
-        -torque * jnp.tanh(rate / speed) for rate in joint_rates(plant, chain, pose_rate, q_rate)
-    )
-    curvature, still = chain.near.curvature, jnp.zeros_like(pose_rate)
-    return (
-        jnp.zeros_like(near) if curvature is None else -curvature * near,
-        near + far,
-        (near[:, None] * at_near + far[:, None] * at_far) / plant.modal_mass[:, None],
-        still if chain.turn is None else jnp.stack([*still[:2], -jnp.sum(far, axis=0)]),
-    )
+    near, far = (-torque * jnp.tanh(rate / speed) for rate in joint_rates(plant, chain, *rates))
+    if chain.near.curvature is not None:
+        force = force - chain.near.curvature * near
+    on_modes = near[:, None] * at_near + far[:, None] * at_far
+    if chain.turn is not None:
+        still = jnp.zeros_like(force) if wrench is None else wrench
+        wrench = jnp.stack([still[0], still[1], still[2] - jnp.sum(far, axis=0)])
+    return force, piezo + on_modes / plant.modal_mass[:, None], wrench, near + far
 
 
 def joint_decay(plant: Plant) -> Array:

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.axial import axial_force, held_coordinates
-from jaxmodel.case import Case, Structure
-from jaxmodel.drive import Reference, slider_force
+from jaxmodel.case import MOTOR_ORDER, Case, Structure
+from jaxmodel.drive import Reference, motor_force, slider_force
 from jaxmodel.drives import DRIVES
 from jaxmodel.dynamics import inverse_dynamics, kinetic_energy, modal_chain
 from jaxmodel.kinematics import close_chain
@@ -24,7 +24,10 @@ from jaxmodel.parameters import Array
 
 
 class LinearPlant(NamedTuple):
-    """x' = A x + B_voltage V_a + B_force F; outputs are rows that multiply x, or V_a."""
+    """x' = A x + B_voltage V_a + B_force F; outputs are rows that multiply x, or V_a.
+
+    States of motors that follow late come last in x.
+    """
 
     state: Array  # A [1/s and mixed], (n, n), n = 6 + 6 (coordinates of a link)
     voltage: Array  # B_voltage, (n, 3 K)
@@ -36,18 +39,22 @@ class LinearPlant(NamedTuple):
     direct_sensor: Array  # [V/V], (3 K, 3 K)
     # what a sampled drive reads: positions of the joints [m], then their speeds [m/s], (2 l, n)
     slider: Array | None = None
+    motor: Array | None = None  # B of commands to motors that follow late, (n, 3); None: as force
 
 
 def flatten(state: PlantState) -> Array:
-    """x = (X, X', q, q') as a vector, (6 + 6 R,)."""
-    return jnp.concatenate([jnp.ravel(jnp.asarray(part)) for part in state[:4]])
+    """x = (X, X', q, q', motors) as a vector."""
+    late = () if state.motor is None else (state.motor,)
+    return jnp.concatenate([jnp.ravel(jnp.asarray(part)) for part in (*state[:4], *late)])
 
 
 def unflatten(x: Array, structure: Structure) -> PlantState:
     """Inverse of `flatten`."""
-    n = structure.n_pose
-    modes = jnp.reshape(x[2 * n :], (2, structure.n_links, structure.n_coordinates))
-    return PlantState(x[:n], x[n : 2 * n], *modes)
+    n, links = structure.n_pose, structure.n_links
+    first = 2 * n + 2 * links * structure.n_coordinates
+    modes = jnp.reshape(x[2 * n : first], (2, links, structure.n_coordinates))
+    motor = jnp.reshape(x[first:], (-1, links)) if structure.has_drive_lag else None
+    return PlantState(x[:n], x[n : 2 * n], modes[0], modes[1], motor=motor)
 
 
 class Moment(NamedTuple):
@@ -99,8 +106,11 @@ def linearise(
         force = axial_force(loop.plant, pose, rate, moment.acceleration, moment.wrench)
         held_q = held_coordinates(loop.plant, force)
         chain = modal_chain(loop.plant, pose, rate, held_q, zero)
-    rest = flatten(PlantState(pose, rate, held_q, zero))
-    has_feedforward = DRIVES[structure.drive].has_feedforward or structure.has_wrench
+    motor = jnp.zeros((MOTOR_ORDER, *still.shape)) if structure.has_drive_lag else None
+    rest = flatten(PlantState(pose, rate, held_q, zero, motor=motor))
+    has_feedforward = (
+        structure.has_drive_lag or DRIVES[structure.drive].has_feedforward or structure.has_wrench
+    )
     reference = Reference(
         rho=chain.rho,
         rho_rate=chain.rho_rate,
@@ -111,17 +121,22 @@ def linearise(
     if moment is not None:
         held = inverse_dynamics(loop.plant, pose, rate, moment.acceleration, moment.wrench)
         smooth = structure._replace(is_smooth=True)
-        drive_force = slider_force(smooth, loop.drive, reference, chain.rho, chain.rho_rate)
+        motors = motor_force(smooth, loop.drive, reference, chain.rho, chain.rho_rate)
+        drive_force = slider_force(smooth, loop.drive, reference, motors, chain.rho_rate)
         reference = reference._replace(disturbance=held - drive_force, wrench=moment.wrench)
 
-    def derivative(x: Array, voltage: Array, force: Array) -> Array:
+    def derivative(x: Array, voltage: Array, force: Array, command: Array) -> Array:
         at = unflatten(x, structure)
         pushed = reference._replace(disturbance=reference.disturbance + force)
+        if structure.has_drive_lag:
+            pushed = pushed._replace(feedforward=command)
         rates = plant_rates(
             structure, loop, at, pushed, jnp.reshape(voltage, (structure.n_links, -1))
         )
         moves = rates.acceleration
-        return flatten(PlantState(at.pose_rate, moves.pose, at.q_rate, moves.modal))
+        return flatten(
+            PlantState(at.pose_rate, moves.pose, at.q_rate, moves.modal, motor=rates.motor)
+        )
 
     def slider(x: Array) -> Array:
         at = unflatten(x, structure)
@@ -133,8 +148,9 @@ def linearise(
 
     n_links = structure.n_links
     n_voltages = structure.n_sensors
-    a, b_voltage, b_force = jax.jacfwd(derivative, (0, 1, 2))(
-        rest, jnp.zeros((n_voltages,), rest.dtype), still
+    inputs = (0, 1, 2, 3) if structure.has_drive_lag else (0, 1, 2)
+    a, b_voltage, b_force, *b_command = jax.jacfwd(derivative, inputs)(
+        rest, jnp.zeros((n_voltages,), rest.dtype), still, still
     )
     direct_deflection = jnp.zeros((n_links * loop.deflection_at.shape[1], n_voltages), rest.dtype)
     direct_sensor = jnp.zeros((n_links * loop.sensor.shape[1], n_voltages), rest.dtype)
@@ -150,12 +166,13 @@ def linearise(
         direct_deflection=direct_deflection,
         direct_sensor=direct_sensor,
         slider=jax.jacfwd(slider)(rest) if is_held else None,
+        motor=b_command[0] if b_command else None,
     )
 
 
 def _rows(matrix: Array, structure: Structure) -> Array:
     """Per-link outputs of q, (3, m, R), as rows over x."""
-    rates = structure.n_links * structure.n_coordinates
+    rates = structure.n_links * structure.n_coordinates + structure.n_motors
     return jnp.pad(_diagonal(matrix), ((0, 0), (2 * structure.n_pose, rates)))
 
 
@@ -166,13 +183,18 @@ def _diagonal(matrix: Array) -> Array:
 
 
 def mechanical(plant: LinearPlant) -> Array:
-    """A with rows and columns in the order (X, q, X', q'), (2 m, 2 m)."""
-    pose = plant.force.shape[1]  # as many joints as coordinates of the pose
-    first, modes = 2 * pose, plant.state.shape[0] // 2 - pose
+    """A with rows and columns in the order (X, q, X', q') and, if they are late, motors."""
+    pose, motors = plant.force.shape[1], n_motors(plant)  # as many joints as pose coordinates
+    first, modes = 2 * pose, (plant.state.shape[0] - motors) // 2 - pose
     position = np.r_[0:pose, first : first + modes]
     velocity = np.r_[pose:first, first + modes : first + 2 * modes]
-    index = np.r_[position, velocity]
+    index = np.r_[position, velocity, first + 2 * modes : plant.state.shape[0]]
     return plant.state[np.ix_(index, index)]
+
+
+def n_motors(plant: LinearPlant) -> int:
+    """States of motors that follow late."""
+    return 0 if plant.motor is None else MOTOR_ORDER * int(plant.motor.shape[1])
 
 
 def mass_and_stiffness(loop: Loop, pose: Array, plant: LinearPlant) -> tuple[Array, Array]:
@@ -196,7 +218,12 @@ def mass_and_stiffness(loop: Loop, pose: Array, plant: LinearPlant) -> tuple[Arr
         return kinetic_energy(loop.plant, chain, pose_rate, rest, q_rate)
 
     mass = jax.hessian(energy)(jnp.zeros(size, rest.dtype))
-    stiffness = -mass @ mechanical(plant)[size:, :size]
+    state = mechanical(plant)
+    by_place, last = state[size : 2 * size, :size], 2 * size
+    if plant.motor is not None:  # at rest motors have followed
+        followed = jnp.linalg.solve(state[last:, last:], state[last:, :size])
+        by_place = by_place - state[size:last, last:] @ followed
+    stiffness = -mass @ by_place
     return mass, (stiffness + stiffness.T) / 2
 
 
@@ -214,10 +241,11 @@ def natural_modes(plant: LinearPlant) -> NaturalModes:
     An undamped machine is solved as lambda^2 of the position block, which keeps rigid modes at
     zero. Otherwise the 2 m poles are paired: conjugates, and a slow real pole with a fast one of
     similar shape. For these, frequency means sqrt(lambda_1 lambda_2) and the damping ratio is 1 or
-    more (1 where the slow one is zero: held only by damping).
+    more (1 where the slow one is zero: held only by damping). Motors that follow late add one mode
+    each, of about 3.5 over their lag.
     """
-    a = np.asarray(mechanical(plant))
-    m = a.shape[0] // 2
+    a, late = np.asarray(mechanical(plant)), n_motors(plant)
+    m = (a.shape[0] - late) // 2
     if not np.any(a[m:, m:]):
         value, vector = np.linalg.eig(a[m:, :m])
         # motion of the pose without any spring is a zero eigenvalue with rounding on top
@@ -229,7 +257,10 @@ def natural_modes(plant: LinearPlant) -> NaturalModes:
     is_real = np.abs(value.imag) <= 1e-9 * np.abs(value).max()
     upper = np.flatnonzero(~is_real & (value.imag > 0))
     real = np.flatnonzero(is_real)
-    real = _paired(real[np.argsort(np.abs(value[real]))], value, vector[:m])
+    real = real[np.argsort(np.abs(value[real]))]
+    # of a motor's three poles the fastest is real, and no mode
+    real = real[: max(len(real) - late // MOTOR_ORDER, 0) // 2 * 2]
+    real = _paired(real, value, vector[:m])
     omega = list(np.abs(value[upper]))
     zeta = list(-value[upper].real / np.abs(value[upper]))
     column = list(upper)

@@ -39,13 +39,14 @@ def linear_residual(structure: Structure, case: Case, matrices: LoopMatrices) ->
     home = inputs.rho[0, 0]
     if matrices.reference is None:
         gains = drive_gains(DRIVES[structure.drive], drive)
-        force = gains.position * (jnp.mean(inputs.rho, axis=1) - home)
-        force = force + gains.rate * jnp.mean(inputs.rho_rate, axis=1)
+        command = gains.position * (jnp.mean(inputs.rho, axis=1) - home)
+        command = command + gains.rate * jnp.mean(inputs.rho_rate, axis=1)
         follow, seen = jnp.zeros((matrices.open.shape[0], 0)), inputs.rho[:, 0, :0]
     else:  # a sampled drive reads its reference at the start of each sample
-        force = jnp.zeros_like(inputs.disturbance)
+        command = jnp.zeros_like(inputs.disturbance)
         seen = jnp.concatenate([inputs.rho[:, 0] - home, inputs.rho_rate[:, 0]], axis=1)
         follow = matrices.reference
+    force = jnp.zeros_like(command)
     if structure.has_wrench:  # a pulse on the platform acts like drive forces that hold against it
         pulse = inputs.wrench - case.load.wrench
         still = jnp.zeros_like(start.state.plant.pose)
@@ -53,21 +54,24 @@ def linear_residual(structure: Structure, case: Case, matrices: LoopMatrices) ->
         force = force - jax.vmap(held)(pulse)
     if inputs.feedforward is not None:
         rest = inputs.feedforward[0, 0]
-        force = force + jnp.mean(inputs.feedforward, axis=1) - rest
-    force = force + inputs.disturbance
+        command = command + jnp.mean(inputs.feedforward, axis=1) - rest
     begins = start.outline.command_end + case.windows.residual_delay
     is_before = inputs.window.time < begins - case.electronics.period / 2
     transition = matrices.open + matrices.feedback
 
-    def advance(x: Array, at: tuple[Array, Array, Array]) -> tuple[Array, None]:
-        force, seen, is_moving = at
-        moved = transition @ x + matrices.force @ force + follow @ seen
+    def pushed(command: Array, force: Array, seen: Array) -> Array:
+        return matrices.motor @ command + matrices.force @ force + follow @ seen
+
+    def advance(x: Array, at: tuple[Array, ...]) -> tuple[Array, None]:
+        *inputs, is_moving = at
+        moved = transition @ x + pushed(*inputs)
         return jnp.where(is_moving, moved, x), None
 
     still = jnp.zeros(transition.shape[0], transition.dtype)
-    x, _ = jax.lax.scan(advance, still, (force, seen, is_before))
+    each = command, force + inputs.disturbance, seen, is_before
+    x, _ = jax.lax.scan(advance, still, each)
     # the machine comes to rest where the drive then holds it
-    held = matrices.force @ (force[-1] - inputs.disturbance[-1]) + follow @ seen[-1]
+    held = pushed(command[-1], force[-1], seen[-1])
     x = x - jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - transition, held)
     size = jnp.sqrt(jnp.sum(x * x))
     size = jnp.where(size > 0, size, 1.0)

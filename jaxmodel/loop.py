@@ -15,13 +15,13 @@ from jaxmodel.actuation import Acting, act, acting_now
 from jaxmodel.axial import stretch_error
 from jaxmodel.case import Drive, Structure
 from jaxmodel.controller import Controller, ControllerState, controller_step, soft_limit
-from jaxmodel.drive import Reference, drive_step, motor_force, slider_force
+from jaxmodel.drive import Reference, drive_step, late_force, motor_force, slider_force
 from jaxmodel.drives.contract import DriveState
 from jaxmodel.dynamics import Accelerations, accelerations, modal_chain, shortening_row
 from jaxmodel.electronics import Amplifier
 from jaxmodel.hysteresis import Hysteresis
 from jaxmodel.integrator import Exponential
-from jaxmodel.joints import joint_forces
+from jaxmodel.joints import rub
 from jaxmodel.kinematics import Chain, chain_status, close_chain
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
@@ -118,6 +118,7 @@ class PlantState(NamedTuple):
     direct_s: Array | None = None  # drained by the amplifiers' inputs [V], (3, K)
     commands: Array | None = None  # on their way, u_(k-2), u_(k-3), .. [V], (J - 2, 3, K)
     plays: Array | None = None  # of the actuators' hysteresis [V], (N, 3, K)
+    motor: Array | None = None  # of motors that follow late, see `drive.LAG` [N], (3, n)
 
 
 class State(NamedTuple):
@@ -164,6 +165,7 @@ class Rates(NamedTuple):
 
     chain: Chain
     acceleration: Accelerations
+    motor: Array | None  # of `PlantState.motor` [N/s], (3, n)
 
 
 def plant_rates(
@@ -185,17 +187,20 @@ def plant_rates(
         chain = modal_chain(loop.plant, state.pose, state.pose_rate, state.q, state.q_rate)
     else:
         chain = close_chain(loop.plant, state.pose, state.pose_rate)
-    force = slider_force(structure, loop.drive, reference, chain.rho, chain.rho_rate)
+    command = motor_force(structure, loop.drive, reference, chain.rho, chain.rho_rate)
+    motors, motor_rate = late_force(loop.drive, command, state.motor)
+    force = slider_force(structure, loop.drive, reference, motors, chain.rho_rate)
     if structure.feedback == "ideal":
         voltage = ideal_voltage(structure, loop, state.q, state.q_rate)
     piezo, torque = jnp.sum(loop.actuator * voltage[:, None], axis=2), None
     wrench = reference.wrench
     if loop.plant.joint_friction is not None:
-        rubbing = joint_forces(loop.plant, chain, state.pose_rate, state.q_rate)
-        piezo = piezo + rubbing[2]
-        if structure.is_coupled:
-            force, torque = force + rubbing[0], rubbing[1]
-            wrench = rubbing[3] if wrench is None else wrench + rubbing[3]
+        moving = state.pose_rate, state.q_rate
+        pushed = rub(loop.plant, chain, moving, force, piezo, wrench)
+        # without coupling only the links feel it
+        force, piezo, wrench, torque = (
+            pushed if structure.is_coupled else (force, pushed[1], wrench, None)
+        )
     rates = accelerations(
         loop.plant,
         chain,
@@ -208,7 +213,7 @@ def plant_rates(
         structure.is_coupled,
         torque,
     )
-    return Rates(chain, rates)
+    return Rates(chain, rates, motor_rate)
 
 
 def linear_rates(
@@ -224,6 +229,8 @@ def linear_rates(
     assert rest is not None
     zero = jax.tree.map(jnp.zeros_like, (state, voltage))
     still = zero[0]._replace(pose=jnp.broadcast_to(rest.pose, state.pose.shape))
+    if still.motor is not None and rest.reference.feedforward is not None:
+        still = still._replace(motor=still.motor + rest.reference.feedforward)
     held = jax.tree.map(lambda x, at: jnp.broadcast_to(at, x.shape), reference, rest.reference)
     away = jax.tree.map(jnp.subtract, (state, reference), (still, held))
     value, change = jax.jvp(
@@ -294,26 +301,31 @@ def plant_step(
         origin: PlantState, x: tuple[Any, ...], slope: tuple[Any, ...], length: Array, push: Array
     ) -> PlantState:
         """exp(A h/2) on the modes of `origin`, Euler from x along `slope` for the pose."""
-        pose, pose_rate = x
+        moved = [None if y is None else y + length * k for y, k in zip(x, slope, strict=True)]
         return state._replace(
-            pose=pose + length * slope[0],
-            pose_rate=pose_rate + length * slope[1],
+            pose=moved[0],
+            pose_rate=moved[1],
+            motor=moved[2],
             q=e[0, 0] * origin.q + e[0, 1] * origin.q_rate + f[0] * push,
             q_rate=e[1, 0] * origin.q + e[1, 1] * origin.q_rate + f[1] * push,
         )
 
-    x = (state.pose, state.pose_rate)
+    x = (state.pose, state.pose_rate, state.motor)
     first = rates(state, start, volts[0])
-    n1, slope1 = first.acceleration.coupling, (state.pose_rate, first.acceleration.pose)
+    n1 = first.acceleration.coupling
+    slope1 = (state.pose_rate, first.acceleration.pose, first.motor)
     a = stage(state, x, slope1, h / 2, n1)
-    second = rates(a, middle, volts[1]).acceleration
-    n2, slope2 = second.coupling, (a.pose_rate, second.pose)
+    second = rates(a, middle, volts[1])
+    n2 = second.acceleration.coupling
+    slope2 = (a.pose_rate, second.acceleration.pose, second.motor)
     b = stage(state, x, slope2, h / 2, n2)
-    third = rates(b, middle, volts[1]).acceleration
-    n3, slope3 = third.coupling, (b.pose_rate, third.pose)
+    third = rates(b, middle, volts[1])
+    n3 = third.acceleration.coupling
+    slope3 = (b.pose_rate, third.acceleration.pose, third.motor)
     c = stage(a, x, slope3, h, 2 * n3 - n1)
-    fourth = rates(c, end, volts[2]).acceleration
-    n4, slope4 = fourth.coupling, (c.pose_rate, fourth.pose)
+    fourth = rates(c, end, volts[2])
+    n4 = fourth.acceleration.coupling
+    slope4 = (c.pose_rate, fourth.acceleration.pose, fourth.motor)
 
     def combine(k: int) -> Array:
         return slope1[k] + 2 * (slope2[k] + slope3[k]) + slope4[k]
@@ -339,6 +351,7 @@ def plant_step(
         voltage=acting.voltage,
         commands=state.commands,
         plays=acting.plays,
+        motor=None if state.motor is None else state.motor + h / 6 * combine(2),
         **_passed(loop, state, acting),
     )
     return after, first
@@ -437,9 +450,11 @@ def advance(
             structure, loop, loop.delayed, plant, inputs, (after.voltage, voltage), held
         )
     reference, chain = _reference(inputs, 0, held), rates.chain
-    motors = motor_force(structure, loop.drive, reference, chain.rho, chain.rho_rate)
+    command = motor_force(structure, loop.drive, reference, chain.rho, chain.rho_rate)
+    motors, _ = late_force(loop.drive, command, plant.motor)
     present = acting_now(loop.hysteresis, plant.voltage, plant.plays, voltage)
-    sample = _sample(loop, plant, inputs, voltage, present, clipped, motors, rates)
+    forces = command, motors
+    sample = _sample(loop, plant, inputs, voltage, present, clipped, forces, rates)
     fixed = metrics.Fixed(loop.omega, loop.modal_omega, loop.rotation, loop.settling_band)
     totals = metrics.accumulate(state.totals, metrics.Instant(sample, inputs.window, fixed))
     record = Record(
@@ -460,7 +475,7 @@ def advance(
         totals=totals,
         status=state.status,
         bad_time=state.bad_time,
-        drive=_next_drive(structure, loop, state.drive, reference, chain, motors),
+        drive=_next_drive(structure, loop, state.drive, reference, chain, command),
     )
     return _freeze_if_bad(structure, loop, state, proposed, chain, inputs), record
 
@@ -617,13 +632,13 @@ def _sample(
     voltage: Array,
     present: Array,
     clipped: Array,
-    motors: Array,
+    forces: tuple[Array, Array],
     rates: Rates,
 ) -> metrics.Sample:
     limit = loop.controller.voltage_limit * (1 - 1e-9)
     highest = jnp.max(jnp.max(jnp.abs(voltage), axis=1), axis=0)
     axial = rates.acceleration.axial
-    is_full = jnp.any(jnp.abs(motors) >= loop.drive.force_limit * (1 - 1e-9), axis=0)
+    is_full = jnp.any(jnp.abs(forces[0]) >= loop.drive.force_limit * (1 - 1e-9), axis=0)
     return metrics.Sample(
         deflection=deflection(loop, plant.q, present),
         q=_modes(loop, plant.q),
@@ -634,7 +649,7 @@ def _sample(
         voltage=voltage,
         is_saturated=jnp.where(highest >= limit, 1.0, 0.0).astype(voltage.dtype),
         is_clipped=clipped,
-        motor_force=motors,
+        motor_force=forces[1],
         is_motor_saturated=jnp.where(is_full, 1.0, 0.0).astype(voltage.dtype),
         axial_force=axial,
         stretch_error=stretch_error(rates.chain, loop.axial_compliance * axial),

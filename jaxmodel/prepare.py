@@ -14,7 +14,7 @@ from jaxmodel.channels import Channels
 from jaxmodel.control import active_modes, condition_number, left_inverse
 from jaxmodel.controller import Controller, Feedback, with_gains
 from jaxmodel.delay import LONGEST, command_change, true_delay
-from jaxmodel.drive import Reference
+from jaxmodel.drive import LAG_POLE, Reference
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import drive_gains
 from jaxmodel.dynamics import inverse_dynamics
@@ -557,6 +557,8 @@ def drive_rate(kind: str, case: Case) -> Array:
         rate = jnp.max(
             (gains.rate + damping) / mass + jnp.sqrt(jnp.maximum(gains.position, 0.0) / mass)
         )
+    late = drive.lag > 0
+    rate = jnp.maximum(rate, jnp.where(late, LAG_POLE / jnp.where(late, drive.lag, 1.0), 0.0))
     return jnp.where(case.drive.is_locked > 0, 0.0, rate)
 
 

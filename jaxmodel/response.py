@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxmodel.bases import station_places
 from jaxmodel.beam import build_basis, held_frequency, left_out_of_loads
-from jaxmodel.case import Case, Structure
+from jaxmodel.case import MOTOR_ORDER, Case, Structure
 from jaxmodel.drive import Reference
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import drive_gains
@@ -71,7 +71,7 @@ def bench_plant(structure: Structure, case: Case, pose: Array) -> BenchPlant:
     n, size = structure.n_pose, structure.n_links * structure.n_coordinates
     still = jnp.zeros((n + size,), pose.dtype)
     # rows that take positions y = (X, q) and accelerations from x and x' = (X', X'', q', q'')
-    eye = jnp.eye(2 * (n + size))
+    eye = jnp.eye(2 * (n + size), len(plant.state))
     place = eye[np.r_[0:n, 2 * n : 2 * n + size]]
     acceleration = eye[np.r_[n : 2 * n, 2 * n + size : 2 * (n + size)]]
 
@@ -185,9 +185,11 @@ def _forces(structure: Structure, loop: Loop, case: Case, pose: Array) -> tuple[
         wrench, force = load[:n], jnp.reshape(load[n:], zero.shape)
         if structure.has_wrench:
             wrench = wrench + case.load.wrench
-        at = PlantState(pose, still, zero, zero)
+        motor = jnp.zeros((MOTOR_ORDER, links)) if structure.has_drive_lag else None
+        at = PlantState(pose, still, zero, zero, motor=motor)
         rates = plant_rates(open_loop, pushed, at, reference._replace(wrench=wrench), force)
-        return flatten(PlantState(still, rates.acceleration.pose, zero, rates.acceleration.modal))
+        moves = rates.acceleration
+        return flatten(PlantState(still, moves.pose, zero, moves.modal, motor=rates.motor))
 
     by_load = jax.jacfwd(derivative)(rates)
     bent = jnp.swapaxes(loop.deflection_at, 1, 2)  # (3, R, S)

@@ -40,7 +40,8 @@ class LoopMatrices(NamedTuple):
     open: Array  # all gains zero, (n, n)
     feedback: Array  # what the gains add, (n, n)
     plant: Array  # A of the continuous uncontrolled plant with drive, for its poles, (m, m)
-    force: Array  # response to drive forces held over the sample, (n, 3)
+    force: Array  # response to forces on the joints held over the sample, (n, 3)
+    motor: Array  # the same to commands of the motors, (n, 3)
     deflection: Array  # chord deflection at the stations [m], rows, (3 S, n)
     # response of a sampled drive's state to the reference of the joints, positions [m], then
     # speeds [m/s], (n, 2 l); None: the drive acts in continuous time
@@ -117,7 +118,8 @@ def loop_matrices(
         open=without,
         feedback=jacobian(start, 1.0, no_reference) - without,
         plant=linearise(smooth, loop, pose, moment).state if drive.is_sampled else plant.state,
-        force=jnp.pad(exact.force, ((0, start.size - n), (0, 0))),
+        force=jnp.pad(exact.force[:, -structure.n_links :], ((0, start.size - n), (0, 0))),
+        motor=jnp.pad(exact.force[:, : structure.n_links], ((0, start.size - n), (0, 0))),
         deflection=jax.jacfwd(deflected)(start),
         reference=jax.jacfwd(step.advance, 2)(start, 0.0, no_reference)
         if drive.is_sampled
@@ -164,7 +166,7 @@ class _Step(NamedTuple):
 def _moved(exact: _Sampled, inputs: Array, servo: DriveState | None) -> Array:
     """Analogue state one sample later, from state and voltages, and the force of the drive."""
     moved = exact.held @ inputs
-    return moved if servo is None else moved + exact.force @ servo.force
+    return moved if servo is None else moved + exact.force[:, : len(servo.force)] @ servo.force
 
 
 def _next_drive(
@@ -223,7 +225,7 @@ class DelayedParts(NamedTuple):
 
     matrix: Array  # transition, 0 for plant and electronics, (m, m)
     state: Array  # A of plant and electronics, (n, n)
-    enters: Array  # B of commands and drive forces, (n, 3 K + 3)
+    enters: Array  # B of commands and motors' commands, (n, 3 K + 3)
     commands: Array  # place of every command u_(k-1) in the state, (3 K,), integers
     forces: Array | None  # place of the forces that a sampled drive holds, (3,), integers
 
@@ -264,7 +266,7 @@ def delayed_parts(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
     return DelayedParts(
         matrix=jax.jacfwd(step.advance)(start, 1.0, jnp.zeros((2 * structure.n_links,), dtype)),
         state=analogue.state,
-        enters=analogue.enters,
+        enters=analogue.enters[:, : n_sensors + structure.n_links],
         commands=jnp.ravel(places.voltage).astype(int),
         forces=None if servo is None else servo.force.astype(int),
     )
@@ -327,7 +329,9 @@ class AnaloguePlant(NamedTuple):
     """Plant and electronics between two samples."""
 
     state: Array  # A, (n, n)
-    enters: Array  # B of commands and drive forces, (n, 3 K + 3)
+    # B of commands, of motors' commands and, where these are late, of forces on the joints,
+    # (n, 3 K + 3) or (n, 3 K + 6)
+    enters: Array
     filtered: slice  # of the state: what the converters see
     voltage: slice | None  # of the state: on the actuators; None: the command itself
 
@@ -337,7 +341,7 @@ class _Sampled(NamedTuple):
 
     held: Array  # by the state and u_(k-1), (n, n + 3 K)
     newest: Array | None  # by u_k, if its delay can be below a sample, (n, 3 K)
-    force: Array  # by drive forces held over the sample, (n, 3)
+    force: Array  # by motors' commands, then forces on the joints, held over the sample, (n, ..)
     present: Array  # command on the actuators, of state and u_(k-1), (3 K, n + 3 K)
 
 
@@ -431,7 +435,10 @@ def analogue_plant(structure: Structure, plant: LinearPlant, case: Case) -> Anal
         commands = commands.at[at["z_rate"]].set(corner**2 * plant.direct_sensor)
         if "s" in at:
             commands = commands.at[at["s"]].set(highpass * plant.direct_sensor)
-    forces = jnp.pad(plant.force, ((0, n - n_plant), (0, 0)))
+    forces = plant.force
+    if plant.motor is not None:
+        forces = jnp.concatenate([plant.motor, forces], axis=1)
+    forces = jnp.pad(forces, ((0, n - n_plant), (0, 0)))
     return AnaloguePlant(
         state=state,
         enters=jnp.concatenate([commands, forces], axis=1),
@@ -577,7 +584,7 @@ def spillover(structure: Structure, case: Case, matrices: LoopMatrices) -> Array
         resting_drive(DRIVES[structure.drive], jnp.zeros((structure.n_links,))),
     )
     count = sum(x.size for x in jax.tree.leaves(drive))
-    kept = np.r_[0 : 2 * last - first, size - count : size]
+    kept = np.r_[0 : 2 * last - first + structure.n_motors, size - count : size]
     plant = matrices.open[np.ix_(kept, kept)]
     loop = matrices.open + matrices.feedback
     (free_energy, free), (energy, closed) = ringing(plant), ringing(loop)

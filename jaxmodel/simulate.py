@@ -280,6 +280,7 @@ def begin(structure: Structure, case: Case) -> Start:
             prepared.initial_q,
             code,
             case.electronics.sensor_highpass,
+            None if outside.inputs.feedforward is None else outside.inputs.feedforward[0, 0],
         ),
         Outline(
             early_time=jnp.where(prepared.status == status.OK, outside.bad_time, 0.0),

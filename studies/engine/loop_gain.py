@@ -19,6 +19,7 @@ from jaxmodel.frequency_response import (
     IMAGES,
     PlantResponse,
     SampledLoopResponse,
+    late_stiffness,
     tail_weights,
 )
 from jaxmodel.notch import notch_response
@@ -170,6 +171,8 @@ class LoopGains(NamedTuple):
         leaving, entering = blocks[..., :k, k:], np.swapaxes(blocks[..., k:, :k], 3, 4)
         taken = carried(np.swapaxes(carried(blocks[..., k:, k:]), 3, 4))
         taken = (w**4)[:, None, :, None, None] * taken
+        if self.plant.servo is not None:
+            taken = taken - late_stiffness(self.plant, 1j * w)
         return blocks[..., :k, :k], carried(leaving), carried(entering), taken
 
     def _modal_sums(self, w: np.ndarray) -> np.ndarray:

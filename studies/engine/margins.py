@@ -139,6 +139,7 @@ def judge_loops(structure: Structure, cases: Case) -> LoopFigures:
         is_sharp |= _unevenness(whole) > UNEVEN
         # no return difference link by link
         is_sharp |= LAWS[structure.law].channel == "none" or DRIVES[structure.drive].is_sampled
+        is_sharp |= structure.has_drive_lag
         rows, is_beyond = np.flatnonzero(~is_sharp), np.zeros(count, bool)
         for sweep in SWEEPS:
             if len(rows):

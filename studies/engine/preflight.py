@@ -134,6 +134,7 @@ def _without_run(structure: Structure) -> Structure:
         "is_coupled",
         "has_wrench",
         "has_joint_friction",
+        "has_drive_lag",
         "controller_basis",
         "law",
         "drive",

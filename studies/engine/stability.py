@@ -87,6 +87,7 @@ def with_margin_modes(
         n_frequencies=1,
         has_noise=False,
         has_hysteresis=False,
+        has_joint_friction=False,
         metrics=(),
         is_smooth=True,
         feedback="sampled",

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 
 from jaxmodel.beam import ModalBasis
 from jaxmodel.dynamics import Accelerations, accelerations, modal_chain
+from jaxmodel.joints import rub
 from jaxmodel.kinematics import Chain
 from jaxmodel.mechanisms.carriers import Carrier, Rail
 from jaxmodel.parameters import Machine
@@ -144,6 +145,20 @@ def close(machine: Machine, basis: ModalBasis, pose: jax.Array, q: jax.Array) ->
     return rho, jnp.arctan2(link[:, 1], link[:, 0]) - jnp.arctan2(tip, length)
 
 
+def joint_angles(machine: Machine, basis: ModalBasis, pose: Any, q: Any) -> Any:
+    """Angles of the links' ends from what they are pinned to [rad], near and far, (2, n)."""
+    rho, beta = close(machine, basis, pose, q)
+    near, far = (beta + jnp.sum(slope * q, axis=1) for slope in jnp.moveaxis(basis.end_slope, 2, 0))
+    carriers = machine.geometry.carriers(0.0, jnp)
+    cranks = [0.0 if isinstance(x, Rail) else x.elbow / x.length for x in carriers]
+    return jnp.stack(
+        [
+            near - jnp.stack(jnp.asarray(cranks)) * rho,
+            far - (pose[2] if len(pose) == 3 else jnp.mean(far)),
+        ]
+    )
+
+
 def kinetic_energy(
     machine: Machine,
     basis: ModalBasis,
@@ -202,14 +217,21 @@ def inertia(energy: Any, z: Any, z_rate: Any) -> Any:
 def closed_form(plant: Plant, motion: RigidState, loads: Loads) -> tuple[Chain, Accelerations]:
     """What the forms below are compared with: `jaxmodel.dynamics` at the same state."""
     chain = modal_chain(plant, *motion)
+    force, modal = loads.slider, loads.modal / plant.modal_mass[:, None]
+    wrench = torque = None
+    if plant.joint_friction is not None:
+        rates = motion.pose_rate, motion.q_rate
+        force, modal, wrench, torque = rub(plant, chain, rates, force, modal, None)
     found = accelerations(
         plant,
         chain,
         motion.pose_rate,
         motion.q,
         motion.q_rate,
-        loads.slider,
-        loads.modal / plant.modal_mass[:, None],
+        force,
+        modal,
+        wrench,
+        torque=torque,
     )
     return chain, found
 
@@ -235,6 +257,9 @@ def by_lagrangian(machine: Machine, basis: ModalBasis, motion: RigidState, loads
     on_modes = modal_load(machine, basis, motion.q, motion.q_rate, loads.modal)
     load = jnp.concatenate([jnp.zeros(n), on_modes.ravel()])
     load = load + jax.jacfwd(lambda z: joint_coordinates(z)[0])(z).T @ loads.slider
+    turns = jax.jacfwd(lambda z: joint_angles(machine, basis, *split(z)))(z)
+    rubbing = jnp.tanh(turns @ z_rate / machine.joint_friction_speed)
+    load = load - machine.joint_friction * jnp.einsum("eiz,ei->z", turns, rubbing)
     return split(jnp.linalg.solve(mass, load - inertial))
 
 

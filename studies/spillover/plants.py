@@ -193,6 +193,7 @@ def plant_structure(design: FixedController, basis: str, n_modes: int) -> Struct
         law=SRF.name,
         drive=nominal.drive,
         has_friction=nominal.has_friction,
+        has_drive_lag=nominal.has_drive_lag,
         has_position_gain=False,
         is_coupled=nominal.is_coupled,
         has_wrench=nominal.has_wrench,

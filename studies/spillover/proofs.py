@@ -202,6 +202,8 @@ def _not_covered(design: FixedController) -> str:
         return (
             f"it covers drives in continuous time alone (drive.kind = {design.structure.drive!r})"
         )
+    if design.structure.has_drive_lag:
+        return "it covers motors that follow at once (drive.lag)"
     return ""
 
 

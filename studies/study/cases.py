@@ -51,6 +51,7 @@ SWITCHES = {
     "has_noise": ("electronics.adc_noise", "drive.ripple", "patches.gauge_noise"),
     "has_friction": ("drive.coulomb_friction",),
     "has_joint_friction": ("machine.joint_friction",),
+    "has_drive_lag": ("drive.lag",),
     "has_poles": ("control.damping", "control.pole_decay"),
     "has_position_gain": ("control.position_gain", "control.damping", "control.pole_decay"),
 }

@@ -404,6 +404,14 @@ class DriveSection(Section):
     viscous_friction: float = described(
         0.0, "N s/m", "viscous friction", ge=0, le=1e4, free=MACHINE
     )
+    lag: float = described(
+        0.0,
+        "s",
+        "dead time from a command to the motors' force: current loop and sample of the servo",
+        ge=0,
+        le=0.1,
+        free=MACHINE,
+    )
     ripple: float = described(
         0.0, "N", "seeded force ripple, rms, new at every sample", ge=0, le=1e3, free=MACHINE
     )

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from jaxmodel.case import Drive
+from jaxmodel.drive import LAG
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import SliderError, drive_force
 from studies.errors import StudyError, field_error
@@ -150,9 +151,9 @@ def settling_time(study: Study) -> float:
 
     The poles are those of the machine with rigid links at the last way-point, its drives held by
     k_p and k_d (and viscous friction): with the inertia M of the pose and the sliders' rates J X',
-    each lambda of J^T J v = lambda M v is a mode s^2 + lambda k_d s + lambda k_p = 0, and of third
-    order where the drive remembers. Where the drives differ from slider to slider, each is taken
-    for all.
+    each lambda of J^T J v = lambda M v is a mode s^2 + lambda k_d s + lambda k_p = 0, and of higher
+    order where the drive remembers or its motor follows late. Where the drives differ from slider
+    to slider, each is taken for all.
 
     Returns:
         inf if a pole has no decay.
@@ -162,7 +163,8 @@ def settling_time(study: Study) -> float:
     half = np.linalg.inv(np.linalg.cholesky(inertia))
     scale = np.linalg.eigvalsh(half @ rates.T @ rates @ half.T)
     drives = np.unique(_drive_slopes(study), axis=0)
-    poles = np.concatenate([_poles(drive, s) for drive in drives for s in scale])
+    late = study.drive.lag, study.drive.viscous_friction
+    poles = np.concatenate([_poles(drive, s, *late) for drive in drives for s in scale])
     decay = float(np.min(-np.real(poles)))
     return math.log(1 / SETTLED) / decay if decay > 0 else math.inf
 
@@ -194,17 +196,24 @@ def _drive_slopes(study: Study) -> np.ndarray:
         if law.update:
             after = np.asarray(law.update(drive, memory, error, force, np.asarray(period)))
             slopes[:, 1, k] = (after - memory) / (_SMALL * period)
-    slopes[:, 0, 1] += written.viscous_friction
     return slopes
 
 
-def _poles(slopes: np.ndarray, scale: float) -> np.ndarray:
-    """Poles of e'' = -scale F_fb under `_drive_slopes` of a slider [1/s], (2,) or (3,)."""
-    (stiffness, resistance, recall), own = slopes
-    if not np.any(own):
-        return np.roots([1.0, scale * resistance, scale * stiffness])
-    state = [[0.0, 1.0, 0.0], [-scale * x for x in (stiffness, resistance, recall)], own]
-    return np.linalg.eigvals(np.array(state))
+def _poles(slopes: np.ndarray, scale: float, lag: float, viscous: float) -> np.ndarray:
+    """Poles of e'' = -scale (F_fb + viscous e') under `_drive_slopes` of a slider [1/s]."""
+    feedback, own = slopes
+    if not np.any(own) and lag == 0:
+        return np.roots([1.0, scale * (feedback[1] + viscous), scale * feedback[0]])
+    state = np.zeros((6, 6))  # e, e', memory, and the states of a motor
+    state[0, 1], state[1, 1], state[2, :3] = 1.0, -scale * viscous, own
+    used = np.r_[0:3] if np.any(own) else np.r_[0:2]
+    if lag == 0:
+        state[1, :3] -= scale * feedback
+    else:
+        used, late = np.r_[used, 3:6], np.array(LAG) / lag
+        state[1, 3], state[3:, 3:] = -scale, late[:, :3]
+        state[3:, :3] = late[:, 3:] * feedback
+    return np.linalg.eigvals(state[np.ix_(used, used)])
 
 
 def rigid_machine(study: Study) -> tuple[np.ndarray, np.ndarray]:

@@ -97,18 +97,18 @@ def check_supported(study: Study) -> None:
     if build_structure(study).has_delay:
         delay = study.electronics.delay + study.electronics.unmodelled_delay
         raise field_error("electronics.delay", delay, "1 for studies twin", "samples")
-    if study.patches.hysteresis > 0:
-        hysteresis = study.patches.hysteresis
-        raise field_error("patches.hysteresis", hysteresis, "0 for studies twin", "1")
     if not BASES[link.basis].is_on_chord:
         names = ", ".join(name for name, one in BASES.items() if one.is_on_chord)
         raise field_error("link.basis", link.basis, f"{names} for studies twin")
-    if any(map(any, initial.modal)):
-        raise field_error("initial.modal", initial.modal, "0 for studies twin", "m")
-    if any(initial.load_deflection):
-        raise field_error(
-            "initial.load_deflection", initial.load_deflection, "0 for studies twin", "m"
-        )
+    for name, value, unit in (
+        ("patches.hysteresis", study.patches.hysteresis, "1"),
+        ("machine.joint_friction", study.machine.joint_friction, "N m"),
+        ("drive.lag", study.drive.lag, "s"),
+        ("initial.modal", initial.modal, "m"),
+        ("initial.load_deflection", initial.load_deflection, "m"),
+    ):
+        if any(np.any(x) for x in np.atleast_1d(np.asarray(value, object))):
+            raise field_error(name, value, "0 for studies twin", unit)
 
 
 def our_runs(study: Study, has_loop: bool = False) -> tuple[Run, Run]:

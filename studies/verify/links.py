@@ -236,6 +236,7 @@ def _integrals(
         largest(basis.link_mass[0], total),
         largest(basis.first_moment[0], first),
         largest(basis.inertia[0], heavy @ x**2 + joint.sum()),
+        largest(basis.end_slope[0], ends.T),
     ]
     if basis.shortening is not None:
         mixed = 0.0 if basis.mixed_shortening is None else basis.mixed_shortening[0]

@@ -87,7 +87,7 @@ def _why_not_linear(study: Study) -> str:
         return "its start in the electronics is not defined"
     if np.any(study.load.wrench):
         return "the machine starts bent by load.wrench"
-    if study.drive.coulomb_friction > 0:
+    if study.drive.coulomb_friction > 0 or study.machine.joint_friction > 0:
         return "friction is not linear"
     return "the control law switches" if LAWS[study.control.law].is_switching else ""
 
@@ -128,7 +128,7 @@ def _release(study: Study) -> Assumption:
     state = np.zeros(len(transition))
     state[first] = _SMALL  # and the filters settled on it
     settled = sensor[0, :, 0] * _SMALL
-    after = first + 2 * modes
+    after = first + 2 * modes + structure.n_motors
     state[after : after + settled.size] = settled
     states = [state]
     for _ in range(_RELEASED - 1):

@@ -45,7 +45,7 @@ def _plant(
     """A machine without structural damping, and the basis of all its coordinates."""
     machine, shortening = _undamped(case.machine), structure.has_shortening
     stretch = stretch_of(structure, case._replace(machine=machine))
-    plant = build_plant(machine, basis, False, shortening, is_distributed, stretch)
+    plant = build_plant(machine, basis, False, shortening, is_distributed, stretch, True)
     return plant, basis if stretch is None else lengthening(basis, stretch)
 
 

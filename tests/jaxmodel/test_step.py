@@ -68,6 +68,7 @@ def parts():
             prepared.initial_q,
             outside.status,
             case.electronics.sensor_highpass,
+            None,
         )
         return prepared.loop, start, jax.tree.map(lambda x: x[100], outside.inputs)
 
