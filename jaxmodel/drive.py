@@ -51,7 +51,7 @@ def _error(reference: Reference, rho: Array, rho_rate: Array) -> SliderError:
     return SliderError(reference.rho - rho, reference.rho_rate - rho_rate)
 
 
-#: Dead time tau by the Pade approximant (2, 3) of exp(-s tau), 1e-4 up to omega tau = 1.5: force F
+#: Dead time tau by the Pade approximant (2, 3) of exp(-s tau), 2e-4 up to omega tau = 1: force F
 #: and two more states x' = LAG (x, u)/tau, which a held command u brings to u.
 LAG = ((-9.0, 6.0, 0.0, 3.0), (-6.0, 0.0, 10.0, -4.0), (-1.0, 0.0, 0.0, 1.0))
 #: Fastest pole of the states, times tau [1].

@@ -43,13 +43,15 @@ def sampled_loop(
     matrices: LoopMatrices, omega: np.ndarray, period: float, n_tracked: int, has_stretch: bool
 ) -> SampledLoop:
     """A loop on the host from matrices of `jaxmodel.sampled_loop`, NumPy arrays."""
-    is_drive = np.arange(len(matrices.open)) < 2 * len(omega)
+    count, size, last = len(omega), len(matrices.plant), 2 * (len(omega) + omega.size)
+    place = np.arange(len(matrices.open))
+    is_drive = (place < 2 * count) | ((place >= last) & (place < size))  # its motors' states
     if matrices.reference is not None:  # the states that it enters are those of a sampled drive
         is_drive |= np.any(matrices.reference != 0, axis=1)
     return SampledLoop(
         open=matrices.open,
         feedback=matrices.feedback,
-        mode_poles=link_poles(matrices.plant, len(omega), n_tracked),
+        mode_poles=link_poles(matrices.plant, count, n_tracked, n_motors=size - last),
         omega=omega,
         has_stretch=has_stretch,
         period=period,
@@ -58,7 +60,11 @@ def sampled_loop(
 
 
 def link_poles(
-    state: np.ndarray, n_links: int, n_tracked: int, n_rigid: int | None = None
+    state: np.ndarray,
+    n_links: int,
+    n_tracked: int,
+    n_rigid: int | None = None,
+    n_motors: int = 0,
 ) -> np.ndarray:
     """Poles [rad/s] of the uncontrolled link modes, by order, then ascending, (J, n_links).
 
@@ -72,8 +78,9 @@ def link_poles(
         n_links: their number.
         n_tracked: J.
         n_rigid: coordinates before the modes; None: as many as links, those of the pose.
+        n_motors: states after the modes, of motors, which count as the drives'.
     """
-    first = 2 * (n_links if n_rigid is None else n_rigid)
+    first, last = 2 * (n_links if n_rigid is None else n_rigid), len(state) - n_motors
     from scipy.linalg import eig
     from scipy.optimize import linear_sum_assignment  # they take a quarter of a second
 
@@ -81,9 +88,9 @@ def link_poles(
     upper = value.imag > 0
     value, factor = value[upper], (left.conj() * right)[:, upper]
     factor = (factor / factor.sum(axis=0)).real
-    orders = factor[first:].reshape(2, n_links, -1, value.size).sum(axis=(0, 1))
-    share = np.vstack([factor[:first].sum(axis=0), orders])
-    place = np.repeat(np.arange(len(share)), [first // 2, *[n_links] * len(orders)])
+    orders = factor[first:last].reshape(2, n_links, -1, value.size).sum(axis=(0, 1))
+    share = np.vstack([factor[:first].sum(axis=0) + factor[last:].sum(axis=0), orders])
+    place = np.repeat(np.arange(len(share)), [first // 2 + n_motors, *[n_links] * len(orders)])
     which, at = linear_sum_assignment(share[place].T, maximize=True)
     order = np.full(value.size, -1)
     order[which] = place[at] - 1
