@@ -158,6 +158,31 @@ def test_friction_from_the_motor_s_force_of_a_move(tmp_path):
         has_effect(one, [0.0, 0.0], number)
 
 
+def test_friction_of_the_joints_from_a_decay_from_20_to_1_um(tmp_path):
+    """Structural damping takes a share of the amplitude, friction an amount."""
+    free = {
+        "machine.joint_friction": {"from": 0.0, "to": 3e-4},
+        "link.damping_ratio": {"from": 0.001, "to": 0.02},
+    }
+    time = np.arange(0.0, 0.06, 1e-4)
+    entry = TRACE | {"output": "sensor 1.2", "sigma": 5e-4}
+    write(tmp_path, "trace.csv", time=time, value=np.ones(len(time)))
+    study = {"run": {"duration": 0.065}, "control": {"modes": 2, "feedback": "none"}}
+    study |= {"motion": {"waypoints": SHORT["motion"]["waypoints"][:1]}}
+    study |= {"metrics": {"residual_delay": 0.002, "residual_length": 0.05}}
+    study |= {"initial": {"modal": [[20e-6, 0.0]] * 3}}
+    problem = posed(spec_of(tmp_path, entry, free=free, study=study))
+    (one,), truth = problem.measurements, np.array([7e-5, 0.006])
+    exact, _ = one.predict(truth, False)
+    start, end = (np.abs(exact[part]).max() for part in (slice(0, 90), slice(-90, None)))
+    assert 12 < start / end < 40
+    one.measured = exact + 5e-4 * np.random.default_rng(0).normal(size=len(time))
+    answer = answered(problem)
+    assert answer.is_explained
+    assert np.all(np.abs(answer.values - truth) < 4 * answer.sigma)
+    assert np.all(answer.sigma < 0.05 * truth)
+
+
 @pytest.mark.parametrize(
     "change, message",
     [
