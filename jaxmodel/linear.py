@@ -241,8 +241,8 @@ def natural_modes(plant: LinearPlant) -> NaturalModes:
     An undamped machine is solved as lambda^2 of the position block, which keeps rigid modes at
     zero. Otherwise the 2 m poles are paired: conjugates, and a slow real pole with a fast one of
     similar shape. For these, frequency means sqrt(lambda_1 lambda_2) and the damping ratio is 1 or
-    more (1 where the slow one is zero: held only by damping). Motors that follow late add one mode
-    each, of about 3.5 over their lag.
+    more (1 where the slow one is zero: held only by damping). Poles of motors that follow late are
+    left out.
     """
     a, late = np.asarray(mechanical(plant)), n_motors(plant)
     m = (a.shape[0] - late) // 2
@@ -257,10 +257,11 @@ def natural_modes(plant: LinearPlant) -> NaturalModes:
     is_real = np.abs(value.imag) <= 1e-9 * np.abs(value).max()
     upper = np.flatnonzero(~is_real & (value.imag > 0))
     real = np.flatnonzero(is_real)
-    real = real[np.argsort(np.abs(value[real]))]
-    # of a motor's three poles the fastest is real, and no mode
-    real = real[: max(len(real) - late // MOTOR_ORDER, 0) // 2 * 2]
-    real = _paired(real, value, vector[:m])
+    if late:  # a real pole and a pair of each motor, in which motors take part most, are no modes
+        part = np.abs(np.linalg.inv(vector).T * vector)[2 * m :].sum(axis=0)
+        upper, real = (x[np.argsort(part[x])][: -late // MOTOR_ORDER] for x in (upper, real))
+        real = real[: len(real) // 2 * 2]
+    real = _paired(real[np.argsort(np.abs(value[real]))], value, vector[:m])
     omega = list(np.abs(value[upper]))
     zeta = list(-value[upper].real / np.abs(value[upper]))
     column = list(upper)

@@ -22,7 +22,13 @@ from studies.show.pages import page
 from studies.show.sketch import CAPTION
 from studies.show.units import is_cut_off, number
 from studies.show.words import control_text, motion_text
-from studies.single.summary import limits_text, link_rows, settling_text, watched
+from studies.single.summary import (
+    joint_notes,
+    limits_text,
+    link_rows,
+    settling_text,
+    watched,
+)
 from studies.study.margin import ENOUGH, MARGIN_MODES, caution, hysteresis_text, stretch_text
 
 #: Figures, by the end of the file name.
@@ -75,7 +81,7 @@ def report(
         metrics=result.metrics,
         loop=run.loop,
         planned=run.motion,
-        notes=notes,
+        notes=[*notes, *joint_notes(run)],
         name=name,
         motion=motion_text(study),
         control=control_text(study),

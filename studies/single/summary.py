@@ -12,6 +12,9 @@ from studies.show import units
 from studies.show.listing import Rows
 from studies.show.units import headed, number
 
+#: Residual vibration below which joints that rub decide [m].
+STICKING = 2e-6
+
 
 def watched(run: Run) -> float:
     """From the end of the shaped command to that of the run [s]."""
@@ -60,3 +63,14 @@ def limits_text(run: Run) -> str:
         if share > 0
     ]
     return f"CAUTION: {'; '.join(warnings)}." if warnings and run.status == status.OK else ""
+
+
+def joint_notes(run: Run) -> list[str]:
+    """That joints decide how little vibration is left, if they do."""
+    residual = np.max(run.result.metrics.residual_rms)
+    if not residual < STICKING or run.study.machine.joint_friction > 0:
+        return []
+    return [
+        "Less than 2 um is left: joints that rub decide there (machine.joint_friction, here 0; "
+        "small ball bearings have 0.05 to 0.5 mN m)."
+    ]

@@ -68,7 +68,7 @@ def test_modes_of_the_flexible_machine_lose_as_much_and_its_run_decays_so(lag, w
     structure, case, loop = parts(lag)
     plant = jax.tree.map(np.asarray, _linearise(structure, loop, np.array(HOME)))
     modes = natural_modes(plant)
-    assert len(modes.frequency) == 9 + 3  # those of the motors are beside them
+    assert len(modes.frequency) == 9  # without those of the motors
     assert modes.damping_ratio[0] == pytest.approx(wanted, rel=0.03)
     kicked = parse_study(MOVE).change(
         drive__lag=lag,
