@@ -7,6 +7,7 @@ import shlex
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import typer
 
@@ -307,3 +308,16 @@ def test_displayed_formulas_are_paragraphs(name):
     parts = re.split(r"\n\s*\n", page(name))
     shown = [part.strip() for part in parts if "$$" in part]
     assert all(part.count("$$") == 2 and part[:2] == part[-2:] == "$$" for part in shown), shown
+
+
+def test_the_table_of_what_is_left_out_is_what_its_script_prints():
+    script = importlib.util.spec_from_file_location("left_out", SITE / "left_out.py")
+    left_out = importlib.util.module_from_spec(script)
+    script.loader.exec_module(left_out)
+    default, stubby = (
+        left_out.rows(study).values() for study in (Study(), Study().change(**left_out.STUBBY))
+    )
+    section = (SITE / "validity.md").read_text().split("## What the equations leave out")[1]
+    table = [row.split("|")[2:4] for row in section.split("\n\n")[2].splitlines()[2:]]
+    written = [[float(cell.split()[0]) for cell in row] for row in table]
+    np.testing.assert_allclose(written, list(zip(default, stubby, strict=True)), rtol=0.03)
