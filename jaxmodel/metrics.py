@@ -346,67 +346,39 @@ _MODAL_ENERGY = _summed(
 )
 
 
+def _in_window(
+    name: str, dims: tuple[str, ...], what: str, read: Callable[[Instant], Array]
+) -> list[Metric]:
+    """rms and peak of a length in the residual window, or while moving."""
+    is_residual = name.startswith("residual")
+    count, place = (
+        (_RESIDUAL, "in the residual window") if is_residual else (_MOVING, "while moving")
+    )
+
+    def weight(at: Instant) -> Array:
+        return at.window.is_residual if is_residual else at.window.is_moving
+
+    def square(at: Instant) -> Array:
+        return weight(at) * _square(read(at))
+
+    def size(at: Instant) -> Array:
+        return weight(at) * jnp.abs(read(at))
+
+    about = {"is_single": not is_residual}
+    return [
+        _rms(f"{name}_rms", dims, "m", f"rms {what} {place}", count, square, **about),
+        _peak(f"{name}_peak", dims, "m", f"peak {what} {place}", size, **about),
+    ]
+
+
 #: All metrics by name, in the order of the files.
 METRICS: Table[Metric] = Table(
     "metric",
     [
-        _rms(
-            "residual_rms",
-            _STATIONS,
-            "m",
-            "rms chord deflection in the residual window",
-            _RESIDUAL,
-            lambda at: at.window.is_residual * _square(at.sample.deflection),
-            is_single=False,
-        ),
-        _peak(
-            "residual_peak",
-            _STATIONS,
-            "m",
-            "peak chord deflection in the residual window",
-            lambda at: at.window.is_residual * jnp.abs(at.sample.deflection),
-            is_single=False,
-        ),
-        _rms(
-            "structural_rms",
-            _STATIONS,
-            "m",
-            "rms chord deflection while moving",
-            _MOVING,
-            lambda at: at.window.is_moving * _square(at.sample.deflection),
-        ),
-        _peak(
-            "structural_peak",
-            _STATIONS,
-            "m",
-            "peak chord deflection while moving",
-            lambda at: at.window.is_moving * jnp.abs(at.sample.deflection),
-        ),
-        _rms(
-            "residual_modal_rms",
-            _MODES,
-            "m",
-            "rms of plant modes in the residual window",
-            _RESIDUAL,
-            lambda at: at.window.is_residual * _square(at.sample.q),
-            is_single=False,
-        ),
-        _peak(
-            "residual_modal_peak",
-            _MODES,
-            "m",
-            "peak of plant modes in the residual window",
-            lambda at: at.window.is_residual * jnp.abs(at.sample.q),
-            is_single=False,
-        ),
-        _rms(
-            "structural_modal_rms",
-            _MODES,
-            "m",
-            "rms of plant modes while moving",
-            _MOVING,
-            lambda at: at.window.is_moving * _square(at.sample.q),
-        ),
+        *_in_window("residual", _STATIONS, "chord deflection", lambda at: at.sample.deflection),
+        *_in_window("structural", _STATIONS, "chord deflection", lambda at: at.sample.deflection),
+        *_in_window("residual_modal", _MODES, "of plant modes", lambda at: at.sample.q),
+        _in_window("structural_modal", _MODES, "of plant modes", lambda at: at.sample.q)[0],
         Metric(
             "settling_time",
             ("link",),
