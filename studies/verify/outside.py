@@ -16,6 +16,7 @@ from jaxmodel.linear import linearise, natural_modes
 from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import prepare
 from jaxmodel.simulate import simulate
+from studies.bench.works import BARE
 from studies.engine.programs import kept_jit
 from studies.engine.stability import loop_report
 from studies.reference import slider_crank, tables
@@ -53,9 +54,8 @@ def _crank() -> list[Assumption]:
 
 @cache
 def _undamped() -> Study:
-    return paper_study().change(
-        link__modes=8, link__damping_ratio=0.0, control__feedback="none", shaper__kind="none"
-    )
+    changes = {"control__feedback": "none", "shaper__kind": "none"}
+    return paper_study().change(**BARE, **changes, link__modes=8, link__damping_ratio=0.0)
 
 
 @kept_jit(static_argnums=0)
@@ -158,8 +158,8 @@ def _fast_move() -> list[Assumption]:
 
 
 def _closed_loop() -> list[Assumption]:
-    """Margin and damping of the paper's machine under the default controller."""
-    study = paper_study().change(link__modes=12)
+    """Margin and damping of bare links under half the paper's gains."""
+    study = paper_study().change(**BARE, link__modes=12)
     structure, case = build_structure(study), as_arrays(build_case(study))
     loop = loop_report(structure, case, np.array(HOME), 1)
     margin, hertz, damping = tables.LOOP

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodel.case import Case, Structure
+from jaxmodel.case import MOTOR_ORDER, Case, Structure
 from jaxmodel.drive import Reference
 from jaxmodel.drives import DRIVES
 from jaxmodel.dynamics import kinetic_energy, modal_chain, potential_energy
@@ -116,7 +116,10 @@ def _at_rest(structure: Structure, case: Case, q: np.ndarray) -> PlantState:
     bent[:, 0] = q
     pose = np.asarray(case.path.waypoints[0], float)
     still = np.zeros_like(pose)
-    return PlantState(pose=pose, pose_rate=still, q=bent, q_rate=zero, z=zero, z_rate=zero)
+    motor = np.zeros((MOTOR_ORDER, structure.n_links)) if structure.has_drive_lag else None
+    return PlantState(
+        pose=pose, pose_rate=still, q=bent, q_rate=zero, z=zero, z_rate=zero, motor=motor
+    )
 
 
 def _energy(study: Study) -> Assumption:
@@ -128,6 +131,8 @@ def _energy(study: Study) -> Assumption:
         drive__kp=0.0,
         drive__kd=0.0,
         drive__kind="pd",
+        drive__lag=0.0,
+        machine__joint_friction=0.0,
         drive__coulomb_friction=0.0,
         drive__viscous_friction=0.0,
         load__wrench=(0.0,) * study.n_pose,
@@ -175,7 +180,7 @@ def _steps(study: Study) -> list[Assumption]:
     order = float(np.log2(change[at - 1] / change[at])) if seen else np.nan
     steps = ", ".join(f"1/{n}" for n in _PARTS[at - 1 : at + 2])
     reason = "" if seen else "the step is exact to rounding"
-    if study.drive.coulomb_friction > 0:
+    if study.drive.coulomb_friction > 0 or study.machine.joint_friction > 0:
         reason = "friction is not smooth"
     elif np.any(study.load.wrench):
         reason = "load.wrench begins with a jump here"
