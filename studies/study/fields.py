@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from studies.study.paths import field_value, known_field, own_place, parse_entry
+from studies.study.paths import as_list, field_value, known_field, own_place, parse_entry
 from studies.study.spec import OWN_FIELDS, Study
 
 Columns = Mapping[str, np.ndarray]
@@ -134,7 +134,7 @@ class Fields:
             entry = parse_entry(name)
             if entry is not None and entry.field == field and entry.indices:
                 if array.ndim == 1:
-                    array = np.repeat(array[:, None], self.study.n_links, axis=1)
+                    array = np.multiply.outer(array, np.array(as_list(field, 1.0, self.study)))
                 if len(array) != len(column):
                     array = np.repeat(array, len(column), axis=0)
                 np.moveaxis(array, 0, -1)[entry.indices] = np.moveaxis(column, 0, -1)
