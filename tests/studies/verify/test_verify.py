@@ -93,15 +93,28 @@ FAULTS = {
     ),
     "a patch off by one": Fault(
         "jaxmodel/prepare.py",
-        "sensor = lambda_s[:, None, None] * jnp.swapaxes(basis.sensor_slope, 1, 2)",
-        "sensor = jnp.roll(lambda_s[:, None, None] * jnp.swapaxes(basis.sensor_slope, 1, 2), 1, 1)",
+        "sensor = lambda_s[:, :, None] * jnp.swapaxes(basis.sensor_slope, 1, 2)",
+        "sensor = jnp.roll(lambda_s[:, :, None] * jnp.swapaxes(basis.sensor_slope, 1, 2), 1, 1)",
         "links and patches",
     ),
     "static correction with the wrong sign": Fault(
         "jaxmodel/prepare.py",
-        "return lambda_s * lambda_a * static_remainder(basis, mode_mask)[0]",
-        "return -lambda_s * lambda_a * static_remainder(basis, mode_mask)[0]",
+        "return lambda_s[:, :, None] * lambda_a[:, None] * static_remainder(basis, mode_mask)[0]",
+        "return -lambda_s[:, :, None] * lambda_a[:, None] * static_remainder(basis, mode_mask)[0]",
         "links and patches",
+    ),
+    "direct terms by patches that are all alike": Fault(
+        "jaxmodel/prepare.py",
+        "return lambda_s[:, :, None] * lambda_a[:, None] * static_remainder(basis, mode_mask)[0]",
+        "return lambda_s[:, :1, None] * lambda_a[:, :1] * static_remainder(basis, mode_mask)[0]",
+        "links and patches",
+    ),
+    "actuators that push along links alike": Fault(
+        "jaxmodel/stretch.py",
+        "free=driven * free,",
+        "free=free,",
+        "links and patches",
+        is_bare=False,
     ),
     "amplitude of a shaper": Fault(
         "jaxmodel/shaper.py",
@@ -227,7 +240,10 @@ start()
 from studies.bench.works import BARE
 from studies.study.spec import parse_study
 from studies.verify.run import CHECKS
-machine = {"load": {"mass": 0.1, "inertia": 1e-4, "offset": [0.02, 0.01]}}
+machine = {
+    "load": {"mass": 0.1, "inertia": 1e-4, "offset": [0.02, 0.01]},
+    "patches": {"sensor_factor": [0.8, 1.1, 1.0], "actuator_factor": [[0.7, 1.0, 1.2]] * 3},
+}
 names = [name for name in CHECKS if name.startswith(sys.argv[1])]
 changes = BARE if sys.argv[2] == "bare" else {}
 rows = [row for name in names for row in CHECKS[name](parse_study(machine).change(**changes))]
