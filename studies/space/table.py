@@ -21,7 +21,7 @@ from studies.space.axes import ALIASES, LABELS, LIMIT, READY_MADE, SHOWN_AS
 from studies.space.condition import evaluate
 from studies.space.designs import design_of
 from studies.space.spec import SweepSpec
-from studies.study.consistency import SAMPLE_LIMIT
+from studies.study.consistency import EACH_PATCH, SAMPLE_LIMIT
 from studies.study.entries import entry_sizes
 from studies.study.fields import Columns, Fields, acting_columns, padded, row_keys
 from studies.study.paths import (
@@ -256,7 +256,7 @@ def metric_sizes(table: CaseTable) -> dict[str, int]:
 
 def _check_shapes(columns: Columns) -> None:
     """Reject lists of different lengths where the program needs equal ones."""
-    for name in ("patches.centers", "shaper.frequencies_hz", "metrics.stations"):
+    for name in ("patches.centers", "shaper.frequencies_hz", "metrics.stations", *EACH_PATCH):
         if name in columns and columns[name].dtype == object:
             raise StudyError(f"{name}: lists of different shape in one sweep; use equal ones")
     for name in ("motion.move_time", "motion.dwell"):
