@@ -36,15 +36,14 @@ def column_of(values: list[Any]) -> np.ndarray:
 def padded(values: list[Any], n_links: int) -> np.ndarray:
     """Numbers, or lists of any length, as one float array with NaN for missing entries.
 
-    Beside lists, one number stands for all links.
+    Beside lists, one number stands for all links; so does one list beside lists of lists.
     """
-    is_list = [isinstance(value, (tuple, list, np.ndarray)) for value in values]
-    if not any(is_list):
+    depth = nesting(values)
+    if depth == 0:
         return np.array(values, float)
-    values = [x if is_it else (x,) * n_links for x, is_it in zip(values, is_list, strict=True)]
+    values = [x if nesting(x) == depth - 1 else (x,) * n_links for x in values]
     if all(np.size(np.array(value, object)) == 0 for value in values):
         return np.zeros((len(values), 0))
-    depth = nesting(values)
     shape = [len(values)] + [0] * depth
     _measure(values, shape, 0)
     array = np.full(shape, np.nan)

@@ -22,7 +22,9 @@ from studies.space.table import build_table
 from studies.spillover.plants import LoopBuilder, PlantVariant, pad_channels
 from studies.spillover.proofs import SINES, collect
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure
+from studies.study.fields import column_of
 from studies.study.numbers import one_study
+from studies.study.paths import as_list
 from studies.study.section import MACHINE
 from studies.study.spec import parse_study
 from studies.verify import links
@@ -195,6 +197,16 @@ def test_what_is_no_factor_is_refused(value, text):
         STUDY.change(patches__sensor_factor=value)
     with pytest.raises(StudyError, match=r"patches.sensor_factor"):
         build_table(small_spec(SWEEP | {"axes": {"patches.sensor_factor": [value]}}))
+
+
+def test_machines_of_a_tuning_mix_numbers_and_lists():
+    """One number is for all patches, a list for all links by patch; a list each link."""
+    study, name = STUDY.change(patches__centers=(0.06, 0.14)), "patches.sensor_factor"
+    each = ((0.9, 1.0), (1.0, 1.1), (1.0, 0.8))
+    column = column_of([as_list(name, x, study) for x in (1.2, (0.9, 1.1), each)])
+    structure = build_structure(study, {name: column})
+    found = build_cases(study, {name: column}, structure).machine.patches.sensor_factor
+    np.testing.assert_array_equal(found, [[[1.2, 1.2]] * 3, [[0.9, 1.1]] * 3, each])
 
 
 def test_a_sweep_has_lists_of_one_shape():
