@@ -201,7 +201,10 @@ def test_what_is_no_factor_is_refused(value, text):
 
 def test_machines_of_a_tuning_mix_numbers_and_lists():
     """One number is for all patches, a list for all links by patch; a list each link."""
-    study, name = STUDY.change(patches__centers=(0.06, 0.14)), "patches.sensor_factor"
+    study, name = (
+        STUDY.change(patches__centers=(0.06, 0.14), control__modes=2),
+        "patches.sensor_factor",
+    )
     each = ((0.9, 1.0), (1.0, 1.1), (1.0, 0.8))
     column = column_of([as_list(name, x, study) for x in (1.2, (0.9, 1.1), each)])
     structure = build_structure(study, {name: column})
