@@ -451,10 +451,11 @@ def test_patches_that_see_or_do_too_much_are_noticed():
     """A link's sensors 1 % above, or actuators 2 % above, constants times slopes."""
     bends = np.array([[0.5, 2.0], [1.0, -3.0]]), np.array([[1.0, 0.5], [2.0, 4.0]])  # (K, R)
     basis = SimpleNamespace(mass=np.array([[0.5, 0.25]]))
+    constants = np.full(2, 2.0), np.full(2, 3.0)  # of each patch
     sees, does = 3.0 * bends[0], 2.0 * bends[1].T / basis.mass.T
     for more, wanted in (((1.0, 1.0), 0.0), ((1.01, 1.0), 0.01 / 1.0), ((1.0, 1.02), 0.02)):
         loop = SimpleNamespace(sensor=[more[0] * sees], actuator=[more[1] * does])
-        found = links._signals(loop, 0, (2.0, 3.0), bends, basis, 0.0)
+        found = links._signals(loop, 0, constants, bends, basis, 0.0)
         np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-15)
 
 
