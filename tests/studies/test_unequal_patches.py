@@ -151,6 +151,7 @@ def test_a_sweep_of_factors_is_of_single_studies():
         )
 
 
+@pytest.mark.long  # in short: only numbers of the loop differ, and cases are single studies
 def test_machine_code_and_scan_of_unequal_patches():
     fast, reference = both(small_spec(SWEEP, link={"modes": 2}))
     check_equal(fast, reference)
@@ -166,7 +167,7 @@ def test_slopes_by_single_factors_are_those_of_differences():
     assert list(free.names) == names
     numbers, build = as_arrays(one_study(study, structure)), free.build(structure)
 
-    @jax.jit
+    @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
     @jax.vmap
     def residual(x):
         def value(x):
