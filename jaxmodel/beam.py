@@ -109,10 +109,11 @@ def build_basis(
 
 
 def by_link(beam: Beam, patches: Patches, stations: Array) -> tuple[Beam, Patches, Array]:
-    """Data of the links with a leading axis, one value per link."""
+    """Data of the links with a leading axis, one value per link; patches without own factors."""
     centers, stations = jnp.asarray(patches.center), jnp.asarray(stations)
     n_links = len(centers)
-    own = _each_link(patches._replace(center=0.0), n_links)._replace(center=centers)
+    alike = patches._replace(center=0.0, sensor_factor=1.0, actuator_factor=1.0)
+    own = _each_link(alike, n_links)._replace(center=centers)
     stations = jnp.broadcast_to(stations, (n_links, stations.shape[-1]))
     return _each_link(beam, n_links), own, stations
 

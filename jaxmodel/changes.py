@@ -14,7 +14,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
 from jaxmodel.lazy import jnp
 from jaxmodel.linear import resting
-from jaxmodel.loop import Loop, coordinate_omega
+from jaxmodel.loop import coordinate_omega
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import loop_matrices
@@ -37,14 +37,14 @@ class MachineChange(NamedTuple):
 
 
 def changed_case(case: Case, change: MachineChange) -> Case:
-    """The case of the changed machine; the gains of its channels are not part of a case.
+    """The case of the changed machine.
 
     Args:
         case: the numbers.
         change: of the machine.
     """
     machine, electronics = case.machine, case.electronics
-    beam, masses, damping = machine.beam, machine.masses, machine.damping
+    beam, patches, masses, damping = machine.beam, machine.patches, machine.masses, machine.damping
     return case._replace(
         machine=machine._replace(
             beam=beam._replace(
@@ -52,7 +52,11 @@ def changed_case(case: Case, change: MachineChange) -> Case:
                 joint_inertia_c=beam.joint_inertia_c + change.joint_inertia,
             ),
             masses=masses._replace(payload_mass=masses.payload_mass + change.payload),
-            patches=machine.patches._replace(center=machine.patches.center + change.patch),
+            patches=patches._replace(
+                center=patches.center + change.patch,
+                sensor_factor=patches.sensor_factor * jnp.exp(change.sensor),
+                actuator_factor=patches.actuator_factor * jnp.exp(change.actuator),
+            ),
             damping=damping._replace(ratio=damping.ratio * jnp.exp(change.damping)[:, None]),
         ),
         electronics=electronics._replace(
@@ -80,21 +84,5 @@ def changed_loop(
     """
     case, late = changed_case(case, change), structure._replace(has_delay=True)
     loop = prepare(late._replace(is_smooth=True, feedback="sampled"), case).loop
-    loop = _with_gains(loop, jnp.exp(change.sensor), jnp.exp(change.actuator))
     matrices = loop_matrices(late, case, loop, law, pose, resting(late, case))
     return matrices.open + matrices.feedback, coordinate_omega(loop)
-
-
-def _with_gains(loop: Loop, sensor: Array, actuator: Array) -> Loop:
-    """A loop whose channels have other gains than the controller believes, (3, K) each [1]."""
-    left_out = loop.left_out
-    if left_out is not None:
-        left_out = left_out._replace(
-            sensor=sensor[:, :, None] * left_out.sensor * actuator[:, None],
-            deflection=left_out.deflection * actuator[:, None],
-        )
-    return loop._replace(
-        sensor=sensor[:, :, None] * loop.sensor,
-        actuator=loop.actuator * actuator[:, None],
-        left_out=left_out,
-    )

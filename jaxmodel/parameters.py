@@ -40,7 +40,7 @@ class Patches(NamedTuple):
     """Pairs of sensor and actuator, which share a centre on opposite faces of the link.
 
     Actuators are piezo patches; sensors, too, or strain gauges on the bare face. () or (3,) each,
-    except the centres.
+    except the centres and factors of single patches. The controller knows no such factor.
     """
 
     center: Array  # [m], (3, n_patches)
@@ -52,11 +52,13 @@ class Patches(NamedTuple):
     d31: Array  # [C/N]
     relative_permittivity: Array  # eps33T/eps0 [1]
     density: Array  # [kg/m3]
-    is_gauge: Array = 0.0  # 1: sensors are strain gauges, 0: piezo patches
     gauge_factor: Array = 2.1  # relative change of resistance over strain [1]
-    bridge: Array = 2500.0  # amplified bridge voltage per relative change of resistance [V]
     gauge_noise: Array = 0.0  # of the bridge's amplifier, rms [V]
     hysteresis: Array = 0.0  # width of the actuators' loop, see `jaxmodel.hysteresis` [1], ()
+    sensor_factor: Array = 1.0  # true over nominal volts of each sensor [1], () or (3, K)
+    actuator_factor: Array = 1.0  # true over nominal force of each actuator [1], () or (3, K)
+    is_gauge: Array = 0.0  # 1: sensors are strain gauges, 0: piezo patches
+    bridge: Array = 2500.0  # amplified bridge voltage per relative change of resistance [V]
     # 1: an actuator is a force at its distance from the section's own neutral axis, 0: a moment
     # as if no sensor were opposite
     is_force: Array = 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from jaxmodel.lazy import jnp
-from jaxmodel.parameters import Array, Beam, Patches
+from jaxmodel.parameters import Array, Beam, Machine, Patches
 
 VACUUM_PERMITTIVITY = 8.8541878128e-12  # [F/m]
 
@@ -111,6 +111,22 @@ def sensor_gain(patches: Patches) -> Array:
     gauge = patches.bridge * patches.gauge_factor / patches.sensor_length
     piezo = actuator_force(patches) / sensor_capacitance(patches)
     return jnp.where(jnp.asarray(patches.is_gauge) > 0, gauge, piezo)
+
+
+def own_factors(patches: Patches) -> tuple[Array, Array]:
+    """`sensor_factor` and `actuator_factor` of each patch [1], (3, K) each."""
+    both, shape = (patches.sensor_factor, patches.actuator_factor), jnp.shape(patches.center)
+    sensor, actuator = (jnp.broadcast_to(jnp.asarray(x), shape) for x in both)
+    return sensor, actuator
+
+
+def patch_constants(machine: Machine) -> tuple[Array, Array]:
+    """lambda_s [V/rad] and lambda_a [N m/V] of each patch with its own factor, (3, K) each."""
+    beam, patches = machine.beam, machine.patches
+    both = sensor_constant(beam, patches), actuator_constant(beam, patches)
+    lambda_s, lambda_a = (jnp.reshape(x, (-1, 1)) for x in both)
+    seen, driven = own_factors(patches)
+    return lambda_s * seen, lambda_a * driven
 
 
 def patch_ends(center: Array, length: Array) -> tuple[Array, Array]:

@@ -31,12 +31,7 @@ from jaxmodel.lazy import compiled, jax, jnp
 from jaxmodel.loop import Delayed, LeftOut, Loop, Rest
 from jaxmodel.notch import design_notch
 from jaxmodel.parameters import Array
-from jaxmodel.piezo import (
-    actuator_constant,
-    bare_stiffness,
-    placement_faults,
-    sensor_constant,
-)
+from jaxmodel.piezo import bare_stiffness, patch_constants, placement_faults
 from jaxmodel.plant import Plant, build_plant, damping_ratio
 from jaxmodel.static import static_remainder
 from jaxmodel.stretch import Stretch, find_stretch, held_voltage
@@ -100,10 +95,10 @@ def prepare(structure: Structure, case: Case) -> Prepared:
     step = electronics.period / structure.substeps
     change = command_change(true_delay(electronics)) if structure.is_delayed else None
     after = step if change is None else (1 - change.share) * step
-    lambda_s, lambda_a = _constants(case)
-    sensor = lambda_s[:, None, None] * jnp.swapaxes(basis.sensor_slope, 1, 2)
+    lambda_s, lambda_a = patch_constants(machine)
+    sensor = lambda_s[:, :, None] * jnp.swapaxes(basis.sensor_slope, 1, 2)
     observer = jnp.einsum("ick,ikr->icr", design.nominal.observer, sensor)
-    actuator = lambda_a[:, None, None] * basis.actuator_slope / basis.mass[:, :, None]
+    actuator = lambda_a[:, None] * basis.actuator_slope / basis.mass[:, :, None]
     deflection_at = basis.deflection_at
     if stretch is not None:
         scale = plant.stretch * stretch.stiffness
@@ -282,13 +277,13 @@ def _left_out(
 
 def _left_out_voltage(case: Case, basis: ModalBasis, mode_mask: Array = 1.0) -> Array:
     """Sensor volts per actuator volt by all but some modes of a basis [V/V], (3, K, K)."""
-    lambda_s, lambda_a = (x[:, None, None] for x in _constants(case))
-    return lambda_s * lambda_a * static_remainder(basis, mode_mask)[0]
+    lambda_s, lambda_a = patch_constants(case.machine)
+    return lambda_s[:, :, None] * lambda_a[:, None] * static_remainder(basis, mode_mask)[0]
 
 
 def left_out_deflection(case: Case, basis: ModalBasis) -> Array:
     """Deflection at the stations that the actuators give modes beyond `basis` [m/V], (3, S, K)."""
-    return _constants(case)[1][:, None, None] * static_remainder(basis)[1]
+    return patch_constants(case.machine)[1][:, None] * static_remainder(basis)[1]
 
 
 def _rest(structure: Structure, case: Case, plant: Plant) -> Rest:
@@ -352,11 +347,10 @@ def spectrum_frequencies(structure: Structure, bases: Bases) -> Array:
     return bases.plant_omega[:, :, None] * span / (2 * jnp.pi)
 
 
-def _constants(case: Case) -> tuple[Array, Array]:
-    beam, patches = case.machine.beam, case.machine.patches
-    count = (case.machine.n_links,)
-    lambda_s = jnp.broadcast_to(sensor_constant(beam, patches), count)
-    return lambda_s, jnp.broadcast_to(actuator_constant(beam, patches), count)
+def _believed(case: Case) -> Case:
+    """The case whose patches are all as the controller believes them to be."""
+    patches = case.machine.patches._replace(sensor_factor=1.0, actuator_factor=1.0)
+    return case._replace(machine=case.machine._replace(patches=patches))
 
 
 def design_controller(structure: Structure, case: Case, bases: Bases) -> ControllerDesign:
@@ -373,11 +367,12 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
     Returns:
         ControllerDesign.
     """
+    case = _believed(case)
     control, electronics = case.control, case.electronics
     model, assembled, n = bases.model, bases.believed_omega, structure.n_controlled
-    lambda_s, lambda_a = _constants(case)
-    sensor = lambda_s[:, None, None] * jnp.swapaxes(model.sensor_slope, 1, 2)  # (3, K, modes)
-    actuator = lambda_a[:, None, None] * model.actuator_slope  # (3, modes, K)
+    lambda_s, lambda_a = patch_constants(case.machine)
+    sensor = lambda_s[:, :, None] * jnp.swapaxes(model.sensor_slope, 1, 2)  # (3, K, modes)
+    actuator = lambda_a[:, None] * model.actuator_slope  # (3, modes, K)
     mask = active_modes(control.n_active, n, structure.n_patches)
     seen, driven = sensor[:, :, :n], jnp.swapaxes(actuator[:, :n], 1, 2)
     # in one call: XLA's CPU compiler aborts on two side by side if C = 1 (jax 0.10)

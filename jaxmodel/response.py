@@ -24,7 +24,7 @@ from jaxmodel.lazy import jax, jnp
 from jaxmodel.linear import flatten, linearise, resting
 from jaxmodel.loop import Loop, PlantState, plant_rates
 from jaxmodel.parameters import Array
-from jaxmodel.piezo import actuator_constant, sensor_constant
+from jaxmodel.piezo import patch_constants
 from jaxmodel.plant import damping_ratio
 from jaxmodel.prepare import Prepared, prepare
 
@@ -124,16 +124,16 @@ def _left_out(structure: Structure, case: Case, prepared: Prepared, pose: Array)
     beam, patches = case.machine.beam, case.machine.patches
     still = jnp.zeros((len(pose) + loop.plant.stiffness.size,), pose.dtype)
     loads = left_out_of_loads(structure.basis, beam, patches, stations, prepared.bases.plant)
-    constants = sensor_constant(beam, patches), 1.0, actuator_constant(beam, patches)
+    lambda_s, lambda_a = (x[:, :, None] for x in patch_constants(case.machine))
     one = jnp.full((structure.n_links, 1), float(loop.left_out is not None))
     ends = one * jnp.array([0.0, 1.0])
     # the motion across a link at its joint, and its change along the link, (3, 2, m)
     across = jax.jacfwd(lambda rate: _point_rates(loop, ends, pose, rate)[0])(still)
     motion = -jnp.stack([across[:, 0], across[:, 1] - across[:, 0]], axis=1)
     volts, bent, driven = (
-        one[..., None] * jnp.reshape(constant * jnp.ones(structure.n_links), (-1, 1, 1)) * part
+        one[..., None] * constant * part
         for constant, part in zip(
-            constants, jnp.split(loads, (k, loads.shape[1] - k), 1), strict=True
+            (lambda_s, 1.0, lambda_a), jnp.split(loads, (k, loads.shape[1] - k), 1), strict=True
         )
     )
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxmodel.beam import by_link
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array, Beam, Damping, Patches
-from jaxmodel.piezo import actuator_force, sensor_gain
+from jaxmodel.piezo import actuator_force, own_factors, sensor_gain
 from jaxmodel.static import Pieces, link_pieces, patch_count, section_mass
 
 #: Frequency at which `Damping.stretch` is the ratio of a longitudinal mode [rad/s].
@@ -81,14 +81,15 @@ def find_stretch(beam: Beam, patches: Patches, damping: Damping, has_patches: bo
         )
 
     links = by_link(beam, patches, jnp.zeros((1,)))[:2]
+    seen, driven = own_factors(patches)
     stiffness, mass, free, strain, local = jax.vmap(one_link)(*links)
     return Stretch(
         stiffness=stiffness,
         damping=2 * jnp.asarray(damping.stretch) / REFERENCE * stiffness,
         mass=mass,
-        free=free,
-        strain=strain,
-        local=local,
+        free=driven * free,
+        strain=seen * strain,
+        local=seen[:, :, None] * local * driven[:, None],
     )
 
 

@@ -21,13 +21,12 @@ from studies.space.axes import ALIASES, LABELS, LIMIT, READY_MADE, SHOWN_AS
 from studies.space.condition import evaluate
 from studies.space.designs import design_of
 from studies.space.spec import SweepSpec
-from studies.study.consistency import SAMPLE_LIMIT
+from studies.study.consistency import EACH_PATCH, SAMPLE_LIMIT
 from studies.study.entries import entry_sizes
 from studies.study.fields import Columns, Fields, acting_columns, padded, row_keys
 from studies.study.paths import (
     Parts,
     as_list,
-    is_each_link,
     known_field,
     parse_entry,
     replaced,
@@ -234,7 +233,7 @@ def values(study: Study, columns: Columns, name: str) -> np.ndarray:
     assert entry is not None
     if isinstance(value, tuple):
         raise StudyError(f"{name}: a list; name one entry of it, such as {name}[0]")
-    if is_each_link(name) and any(column.startswith(f"{name}[") for column in columns):
+    if any(column.startswith(f"{name}[") for column in columns):
         raise StudyError(f"{name}: differs between links here; name one, such as {name}[0]")
     if not entry.indices and name in columns:
         raise StudyError(f"{name}: a list in this sweep; name one entry of it, such as {name}[0]")
@@ -257,7 +256,7 @@ def metric_sizes(table: CaseTable) -> dict[str, int]:
 
 def _check_shapes(columns: Columns) -> None:
     """Reject lists of different lengths where the program needs equal ones."""
-    for name in ("patches.centers", "shaper.frequencies_hz", "metrics.stations"):
+    for name in ("patches.centers", "shaper.frequencies_hz", "metrics.stations", *EACH_PATCH):
         if name in columns and columns[name].dtype == object:
             raise StudyError(f"{name}: lists of different shape in one sweep; use equal ones")
     for name in ("motion.move_time", "motion.dwell"):
@@ -388,7 +387,7 @@ def _varying_text(study: Study, columns: Columns) -> dict[str, list[str]]:
         if entry is None or not entry.indices:
             continue
         base = whole.get(entry.field) or [known_field(entry.field, study)] * len(column)
-        base = [as_list(entry.field, value, study.n_links) for value in base]
+        base = [as_list(entry.field, value, study) for value in base]
         whole[entry.field] = [
             replaced(value, entry.indices, new)
             for value, new in zip(base, column.tolist(), strict=True)

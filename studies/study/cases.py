@@ -235,12 +235,9 @@ def _machine(numbers: Numbers, structure: Structure, xp: Any) -> Machine:
         beam=Beam(*(number(f"link.{name}") for name in Beam._fields)),
         patches=Patches(
             center=number("patches.centers"),
-            **{name: number(f"patches.{name}") for name in Patches._fields[1:9]},
+            **{name: number(f"patches.{name}") for name in Patches._fields[1:-4]},
             is_gauge=1.0 * number("patches.sensor"),
-            gauge_factor=number("patches.gauge_factor"),
             bridge=_bridge(numbers),
-            gauge_noise=number("patches.gauge_noise"),
-            hysteresis=number("patches.hysteresis"),
             is_force=1.0 * number("link.stretch"),
             is_paired=1.0 * number("patches.actuators"),
         ),

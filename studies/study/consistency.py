@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 #: A run with more plant steps than this would not fit into memory with its trajectories.
 SAMPLE_LIMIT = 2_000_000
+#: Fields that take one number for all patches, one list for all links by patch, or one each link.
+EACH_PATCH = ("patches.sensor_factor", "patches.actuator_factor")
 #: Bandwidth of the slowest amplifier [Hz].
 SLOWEST_AMPLIFIER = 1.0
 
@@ -83,11 +86,18 @@ def check_consistency(study: Study) -> None:
 
 
 def check_own_fields(study: Study) -> None:
-    """Check the own fields of laws, drives and mechanisms.
+    """Check the own fields of laws, drives and mechanisms, and those of single patches.
 
     Raises:
         StudyError: one that there is not, or a number out of its bounds.
     """
+    count = patch_centers(study).shape[1]
+    for field in EACH_PATCH:
+        value = attrgetter(field)(study)
+        rows = _nested(value) or (value,)
+        if isinstance(value, tuple) and any(len(row) != count for row in rows):
+            allowed = f"one number, {count} of them (one a patch), or such a list each link"
+            raise field_error(field, value, allowed, "1")
     _check_own_fields("control.laws", study.control.laws, LAWS)
     _check_own_fields("drive.kinds", study.drive.kinds, DRIVES)
     _check_own_fields("machine.kinds", study.machine.kinds, MECHANISMS)

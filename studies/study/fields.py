@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from studies.study.paths import field_value, known_field, own_place, parse_entry
+from studies.study.paths import as_list, field_value, known_field, own_place, parse_entry
 from studies.study.spec import OWN_FIELDS, Study
 
 Columns = Mapping[str, np.ndarray]
@@ -36,15 +36,14 @@ def column_of(values: list[Any]) -> np.ndarray:
 def padded(values: list[Any], n_links: int) -> np.ndarray:
     """Numbers, or lists of any length, as one float array with NaN for missing entries.
 
-    Beside lists, one number stands for all links.
+    Beside lists, one number stands for all links; so does one list beside lists of lists.
     """
-    is_list = [isinstance(value, (tuple, list, np.ndarray)) for value in values]
-    if not any(is_list):
+    depth = nesting(values)
+    if depth == 0:
         return np.array(values, float)
-    values = [x if is_it else (x,) * n_links for x, is_it in zip(values, is_list, strict=True)]
+    values = [x if nesting(x) == depth - 1 else (x,) * n_links for x in values]
     if all(np.size(np.array(value, object)) == 0 for value in values):
         return np.zeros((len(values), 0))
-    depth = nesting(values)
     shape = [len(values)] + [0] * depth
     _measure(values, shape, 0)
     array = np.full(shape, np.nan)
@@ -134,7 +133,7 @@ class Fields:
             entry = parse_entry(name)
             if entry is not None and entry.field == field and entry.indices:
                 if array.ndim == 1:
-                    array = np.repeat(array[:, None], self.study.n_links, axis=1)
+                    array = np.multiply.outer(array, np.array(as_list(field, 1.0, self.study)))
                 if len(array) != len(column):
                     array = np.repeat(array, len(column), axis=0)
                 np.moveaxis(array, 0, -1)[entry.indices] = np.moveaxis(column, 0, -1)

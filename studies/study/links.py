@@ -14,6 +14,7 @@ from studies.study.sizes import LINK
 
 Basis = Annotated[str, OneOf(lambda: BASES)]
 Zeta = Annotated[float, Field(ge=0, lt=1)]
+Factor = Annotated[float, Field(ge=0, le=10)]
 Number = TypeVar("Number")
 #: One for each link.
 OneALink: TypeAlias = Annotated[tuple[Number, ...], LINK]
@@ -21,6 +22,8 @@ OneALink: TypeAlias = Annotated[tuple[Number, ...], LINK]
 EachLink: TypeAlias = Number | OneALink[Number]
 #: One list a link, by mode or patch.
 ListALink: TypeAlias = Annotated[tuple[tuple[Number, ...], ...], LINK]
+#: One number for all patches or modes, one list for all links, or one list a link.
+ByPatch: TypeAlias = Number | tuple[Number, ...] | ListALink[Number]
 #: One number for all links, one for each, or one list a link by mode; empty: none given.
 EachMode: TypeAlias = EachLink[Number] | tuple[()] | ListALink[Number]
 
@@ -85,7 +88,7 @@ class LinkSection(Section):
         "model mismatch: true over nominal bending stiffness, which controller and shaper assume",
         free=MACHINE,
     )
-    damping_ratio: Zeta | tuple[Zeta, ...] | ListALink[Zeta] = described(
+    damping_ratio: ByPatch[Zeta] = described(
         0.01,
         "1",
         "of mode 1; or by mode, for example measured: one list for all links, or one each",
@@ -142,6 +145,16 @@ class PatchesSection(Section):
     )
     density: EachLink[Annotated[float, Field(ge=0, le=3e4)]] = described(
         7800.0, "kg/m3", "density of the ceramic", free=MACHINE
+    )
+    sensor_factor: ByPatch[Factor] = described(
+        1.0,
+        "1",
+        "model mismatch: true over nominal sensitivity of each sensor, which the controller does "
+        "not know; one number for all, one list for all links by patch, or one list each link",
+        free=MACHINE,
+    )
+    actuator_factor: ByPatch[Factor] = described(
+        1.0, "1", "model mismatch: true over nominal force of each actuator", free=MACHINE
     )
     sensor: Literal["piezo", "strain_gauge"] = described(
         "piezo", "-", "sensors: piezo patches, or strain gauges of sensor_length on the bare face"

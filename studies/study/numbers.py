@@ -19,6 +19,7 @@ import numpy as np
 
 from jaxmodel.case import Structure
 from jaxmodel.laws.state_space import STATE_SPACE
+from studies.study.consistency import EACH_PATCH
 from studies.study.fields import Columns, Fields, nesting
 from studies.study.paths import Parts, all_fields, field_choices, own_fields, own_place, parse_entry
 from studies.study.sizes import alternatives, depth, has_one_a_link
@@ -130,7 +131,7 @@ def _array(fields: Fields, field: str, structure: Structure) -> np.ndarray:
         missing = max(map(depth, alternatives(_annotation(field)))) + 1 - array.ndim
         return array.reshape(*array.shape, *[0] * missing)
     if array.ndim == 1:
-        array = array[:, None]
+        array = np.repeat(array[:, None], structure.n_patches if field in EACH_PATCH else 1, axis=1)
     is_for_all = form == "list of links" and array.ndim == 2
     return np.repeat(array[:, None], structure.n_links, axis=1) if is_for_all else array
 

@@ -21,7 +21,13 @@ from jaxmodel.mechanisms.contract import Mechanism
 from jaxmodel.mechanisms.prrr import PRRR
 from jaxmodel.table import Parameter
 from studies.errors import StudyError, field_error, nearest_field, shown
-from studies.study.consistency import check_consistency, check_mechanism, check_own_fields
+from studies.study.consistency import (
+    EACH_PATCH,
+    check_consistency,
+    check_mechanism,
+    check_own_fields,
+    patch_centers,
+)
 from studies.study.explain import choices_of, unit_of
 from studies.study.sizes import alternatives, depth, has_one_a_link
 from studies.study.spec import (
@@ -177,9 +183,13 @@ def free_fields(parts: Iterable[Parts], *roles: str) -> tuple[str, ...]:
     return tuple(names)
 
 
-def as_list(field: str, value: Any, n_links: int) -> Any:
-    """A field's value as a list of entries: one a link if one number stands for all links."""
-    return (value,) * n_links if is_each_link(field) and not isinstance(value, tuple) else value
+def as_list(field: str, value: Any, study: Study) -> Any:
+    """A field's value as a list of entries: one a link, or patch of a link, if one is for all."""
+    if field in EACH_PATCH and not isinstance(value, tuple):
+        value = (value,) * patch_centers(study).shape[1]
+    elif isinstance(value, tuple) or not is_each_link(field):
+        return value
+    return (value,) * study.n_links
 
 
 def known_field(name: str, study: Study, path: str = "", others: Iterable[str] = ()) -> Any:
@@ -203,7 +213,7 @@ def known_field(name: str, study: Study, path: str = "", others: Iterable[str] =
         hint = f"did you mean {close!r}?" if close else "see studies init --all for all fields"
         raise StudyError(f"{where}{shown(name)}: unknown field; {hint}")
     value = field_value(study, entry.field)
-    value = as_list(entry.field, value, study.n_links) if entry.indices else value
+    value = as_list(entry.field, value, study) if entry.indices else value
     for index in entry.indices:
         if not isinstance(value, tuple) or index >= len(value):
             size = f"0 to {len(value) - 1}" if isinstance(value, tuple) and value else "none"
@@ -232,7 +242,7 @@ def set_values(study: Study, values: Mapping[str, Any]) -> dict[str, Any]:
             target = target.setdefault(section, {})
         if entry.indices:
             whole = target[leaf] if leaf in target else field_value(study, entry.field)
-            value = replaced(as_list(entry.field, whole, study.n_links), entry.indices, value)
+            value = replaced(as_list(entry.field, whole, study), entry.indices, value)
         target[leaf] = value
     return study.with_kind(data)
 

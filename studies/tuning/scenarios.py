@@ -11,7 +11,7 @@ from studies.engine.chunks import distinct_loops
 from studies.show.units import count_text
 from studies.study.cases import build_cases, build_structure
 from studies.study.fields import Columns, column_of
-from studies.study.paths import as_tuples, known_field, set_values
+from studies.study.paths import as_list, as_tuples, known_field, set_values
 from studies.study.spec import Study, parse_study
 from studies.tuning.spec import Family, TuneSpec, others
 
@@ -44,7 +44,7 @@ def scenario_columns(
         baseline = [] if is_fresh else [known_field(name, spec.study)]
         column = [as_tuples(x) for x in baseline + others(values, count, is_fresh)]
         if any(isinstance(x, tuple) for x in column):  # one number stands for all links
-            column = [x if isinstance(x, tuple) else (x,) * spec.study.n_links for x in column]
+            column = [as_list(name, x, spec.study) for x in column]
         machines[name] = column_of(column)
     columns = {name: _repeat(column, moves) for name, column in machines.items()}
     for name in spec.tune.scenarios.each:

@@ -42,6 +42,7 @@ class Link(NamedTuple):
     joint_inertia: tuple[float, float]  # J_B, J_C at its ends [kg m2]
     sensor_ends: np.ndarray  # from joint B [m], (K, 2)
     actuator_ends: np.ndarray  # [m], (K, 2)
+    factors: tuple[np.ndarray, ...]  # true over nominal of sensors, and of actuators [1], (K,) each
     sensor_constant: float  # lambda_s [V/rad]
     actuator_constant: float  # lambda_a [N m/V], where no sensor is opposite
     push: float  # of an actuator along the link [N/V]; 0: none
@@ -120,7 +121,10 @@ def _link(machine: Machine, i: int, has_patches: bool, has_stretch: bool) -> Lin
 
     beam = Beam._make(map(own, machine.beam))
     every = machine.patches._asdict()
-    center = np.asarray(every.pop("center"))[i]
+    center, *factors = (
+        np.broadcast_to(np.asarray(every.pop(name)), np.shape(machine.patches.center))[i]
+        for name in ("center", "sensor_factor", "actuator_factor")
+    )
     patches = Patches(center=center, **{name: own(value) for name, value in every.items()})
     damping = machine.damping
     arm = (beam.thickness + patches.thickness) / 2
@@ -150,6 +154,7 @@ def _link(machine: Machine, i: int, has_patches: bool, has_stretch: bool) -> Lin
         joint_inertia=(beam.joint_inertia_b, beam.joint_inertia_c) if has_patches else (0.0, 0.0),
         sensor_ends=sensors,
         actuator_ends=actuators,
+        factors=tuple(factors),
         sensor_constant=volts * arm,
         actuator_constant=constant,
         push=own_push,

@@ -49,7 +49,7 @@ class Reader:
             sine = left[:, 0] * right[:, 1] - left[:, 1] * right[:, 0]
             cosine = np.sum(left * right, axis=1)
             bent = link.sensor_constant * np.arctan2(sine, cosine)
-            rows.append(bent - link.membrane * longer[0])
+            rows.append(link.factors[0] * (bent - link.membrane * longer[0]))
         return np.stack(rows)
 
     def pose(self) -> np.ndarray:
@@ -68,10 +68,11 @@ class Reader:
             voltage: [V], (n, K).
         """
         for i, (mesh, link) in enumerate(zip(self._model.meshes, self._machine.links, strict=True)):
-            moment, force = voltage[i] @ mesh.moment, np.zeros((len(mesh.x), 2))
+            volts, force = link.factors[1] * voltage[i], np.zeros((len(mesh.x), 2))
+            moment = volts @ mesh.moment
             place = self._nodes(i)[mesh.actuator_nodes, :2]  # (K, 2, 2)
             along = place[:, 1] - place[:, 0]
-            along *= (link.push * voltage[i] / np.hypot(*along.T))[:, None]
+            along *= (link.push * volts / np.hypot(*along.T))[:, None]
             np.add.at(force, mesh.actuator_nodes, np.stack([-along, along], axis=1))
             for node, (push, turn) in self._model.patch_loads[i].items():
                 self._set(push, [*force[node].tolist(), 0.0])

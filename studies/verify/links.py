@@ -43,6 +43,8 @@ def check_links(study: Study) -> list[Assumption]:
     structure, case, (loop, *_) = prepared(study)
     kind = structure.basis
     integrals, signals, statics, axial = [], [], [], []
+    each, own = np.shape(case.machine.patches.center), study.patches
+    factors = [np.broadcast_to(x, each) for x in (own.actuator_factor, own.sensor_factor)]
     for i in range(structure.n_links):
         beam, patches = _one(case.machine.beam, i), _one(case.machine.patches, i)
         beam = beam._replace(length=float(beam.length))
@@ -54,11 +56,14 @@ def check_links(study: Study) -> list[Assumption]:
         )
         integrals.append(_integrals(basis, beam, shape[: x.size], slope[: x.size], x, line))
         beside = slope[x.size :].reshape(2, 2, -1, structure.n_modes)
-        constants = _constants(beam, patches)
+        believed = _constants(beam, patches)
         bends = beside[:, 1] - beside[:, 0]
-        gain = _opposite_gain(patches, sections, constants) if structure.has_stretch else 0.0
+        gain = _opposite_gain(patches, sections, believed) if structure.has_stretch else 0.0
+        constants, membrane = (
+            [factor[i] * x for factor, x in zip(factors, pair, strict=True)]
+            for pair in (believed, _membrane(beam, patches, believed))
+        )
         signals.append(_signals(loop, i, constants, bends, basis, gain))
-        membrane = _membrane(beam, patches, constants)
         statics.append(_statics(loop, i, sections, (*constants, *membrane), gain))
         if structure.has_stretch:
             axial.append(_elongation(loop, i, sections, membrane))
@@ -328,7 +333,7 @@ def _opposite_gain(
 def _signals(
     loop: Loop,
     i: int,
-    constants: tuple[float, float],
+    constants: list[np.ndarray],
     bends: np.ndarray,
     basis: ModalBasis,
     gain: float,
@@ -336,9 +341,9 @@ def _signals(
     """What the loop's sensors see and its actuators do, against constants times slopes."""
     actuator, sensor = constants
     modes = basis.mass.shape[1]
-    sees = largest(loop.sensor[i][:, :modes], sensor * bends[0])
+    sees = largest(loop.sensor[i][:, :modes], sensor[:, None] * bends[0])
     pushes = bends[1] + gain * bends[0]
-    does = largest(loop.actuator[i][:modes].T, actuator * pushes / basis.mass[0])
+    does = largest(loop.actuator[i][:modes].T, actuator[:, None] * pushes / basis.mass[0])
     return worst(sees, does)
 
 
@@ -346,12 +351,13 @@ def _statics(
     loop: Loop,
     i: int,
     sections: list[Segment],
-    constants: tuple[float, float, float, float],
+    constants: tuple[np.ndarray, ...],
     gain: float,
 ) -> float:
     """Held voltages: sensors by all modes, against moments integrated over the link.
 
-    Links that lengthen are free of tension; constants are those of `_constants` and `_membrane`.
+    Links that lengthen are free of tension; constants are those of `_constants` and `_membrane`
+    times the factors of each patch, (K,).
     """
     if loop.left_out is None:
         return 0.0
@@ -361,17 +367,16 @@ def _statics(
         width = section.right - section.left
         for k in section.sensors:
             for m in section.actuators:
-                wanted[k, m] += sensor * actuator * (1 + gain) * width / section.stiffness
+                bent = sensor[k] * actuator[m] * (1 + gain)
+                wanted[k, m] += bent * width / section.stiffness
                 if loop.plant.stretch is not None:
-                    wanted[k, m] += membrane * force * width / section.axial
+                    wanted[k, m] += membrane[k] * force[m] * width / section.axial
     stiffness = loop.plant.stiffness[i] / loop.plant.modal_mass[i]
     modal = (loop.sensor[i] / stiffness) @ loop.actuator[i]
     return largest(modal + loop.left_out.sensor[i], wanted)
 
 
-def _elongation(
-    loop: Loop, i: int, sections: list[Segment], constants: tuple[float, float]
-) -> float:
+def _elongation(loop: Loop, i: int, sections: list[Segment], constants: list[np.ndarray]) -> float:
     """Stiffness, inertia, forces and volts of a link's elongation, section by section."""
     assert loop.plant.stretch is not None
     (force, membrane), scale = constants, float(loop.plant.stretch[i])
@@ -389,5 +394,5 @@ def _elongation(
         largest(loop.plant.stiffness[i, -1] / scale**2, 1 / soft.sum()),
         largest(own / scale**2, mass),
         largest(loop.sensor[i, :, -1] / scale, membrane * seen),
-        np.abs(loop.actuator[i, -1] * own / scale - force * pushed).max() / max(force, 1e-9),
+        np.abs(loop.actuator[i, -1] * own / scale - force * pushed).max() / max(*force, 1e-9),
     )

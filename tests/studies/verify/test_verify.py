@@ -93,15 +93,28 @@ FAULTS = {
     ),
     "a patch off by one": Fault(
         "jaxmodel/prepare.py",
-        "sensor = lambda_s[:, None, None] * jnp.swapaxes(basis.sensor_slope, 1, 2)",
-        "sensor = jnp.roll(lambda_s[:, None, None] * jnp.swapaxes(basis.sensor_slope, 1, 2), 1, 1)",
+        "sensor = lambda_s[:, :, None] * jnp.swapaxes(basis.sensor_slope, 1, 2)",
+        "sensor = jnp.roll(lambda_s[:, :, None] * jnp.swapaxes(basis.sensor_slope, 1, 2), 1, 1)",
         "links and patches",
     ),
     "static correction with the wrong sign": Fault(
         "jaxmodel/prepare.py",
-        "return lambda_s * lambda_a * static_remainder(basis, mode_mask)[0]",
-        "return -lambda_s * lambda_a * static_remainder(basis, mode_mask)[0]",
+        "return lambda_s[:, :, None] * lambda_a[:, None] * static_remainder(basis, mode_mask)[0]",
+        "return -lambda_s[:, :, None] * lambda_a[:, None] * static_remainder(basis, mode_mask)[0]",
         "links and patches",
+    ),
+    "direct terms by patches that are all alike": Fault(
+        "jaxmodel/prepare.py",
+        "return lambda_s[:, :, None] * lambda_a[:, None] * static_remainder(basis, mode_mask)[0]",
+        "return lambda_s[:, :1, None] * lambda_a[:, :1] * static_remainder(basis, mode_mask)[0]",
+        "links and patches",
+    ),
+    "actuators that push along links alike": Fault(
+        "jaxmodel/stretch.py",
+        "free=driven * free,",
+        "free=free,",
+        "links and patches",
+        is_bare=False,
     ),
     "amplitude of a shaper": Fault(
         "jaxmodel/shaper.py",
@@ -227,7 +240,10 @@ start()
 from studies.bench.works import BARE
 from studies.study.spec import parse_study
 from studies.verify.run import CHECKS
-machine = {"load": {"mass": 0.1, "inertia": 1e-4, "offset": [0.02, 0.01]}}
+machine = {
+    "load": {"mass": 0.1, "inertia": 1e-4, "offset": [0.02, 0.01]},
+    "patches": {"sensor_factor": [0.8, 1.1, 1.0], "actuator_factor": [[0.7, 1.0, 1.2]] * 3},
+}
 names = [name for name in CHECKS if name.startswith(sys.argv[1])]
 changes = BARE if sys.argv[2] == "bare" else {}
 rows = [row for name in names for row in CHECKS[name](parse_study(machine).change(**changes))]
@@ -440,10 +456,11 @@ def test_patches_that_see_or_do_too_much_are_noticed():
     """A link's sensors 1 % above, or actuators 2 % above, constants times slopes."""
     bends = np.array([[0.5, 2.0], [1.0, -3.0]]), np.array([[1.0, 0.5], [2.0, 4.0]])  # (K, R)
     basis = SimpleNamespace(mass=np.array([[0.5, 0.25]]))
+    constants = np.full(2, 2.0), np.full(2, 3.0)  # of each patch
     sees, does = 3.0 * bends[0], 2.0 * bends[1].T / basis.mass.T
     for more, wanted in (((1.0, 1.0), 0.0), ((1.01, 1.0), 0.01 / 1.0), ((1.0, 1.02), 0.02)):
         loop = SimpleNamespace(sensor=[more[0] * sees], actuator=[more[1] * does])
-        found = links._signals(loop, 0, (2.0, 3.0), bends, basis, 0.0)
+        found = links._signals(loop, 0, constants, bends, basis, 0.0)
         np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-15)
 
 
