@@ -61,6 +61,7 @@ class Patches(NamedTuple):
     # as if no sensor were opposite
     is_force: Array = 0.0
     is_paired: Array = 0.0  # 1: actuators on both faces, of opposite polarity; 0: on one
+    strain_limit: Array = 4e-4  # tolerated strain of the ceramics [1], ()
 
 
 class Damping(NamedTuple):

@@ -28,17 +28,20 @@ from jaxmodel.laws.contract import NominalModel, check_feedback
 from jaxmodel.laws.poles import is_unplaceable
 from jaxmodel.lazy import compiled, jax, jnp
 from jaxmodel.loop import Delayed, LeftOut, Loop, Rest
+from jaxmodel.metrics import is_accumulated
 from jaxmodel.notch import design_notch
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import (
     actuator_constant,
     bare_stiffness,
+    is_alone,
+    outer_distance,
     placement_faults,
     sensor_constant,
 )
 from jaxmodel.plant import Plant, build_plant, damping_ratio
 from jaxmodel.static import static_remainder
-from jaxmodel.stretch import Stretch, find_stretch, held_voltage
+from jaxmodel.stretch import Stretch, find_stretch, held_strain, held_voltage
 
 #: Frequencies of the spectra lie within this fraction of the modal frequency [1].
 SPECTRUM_SPAN = 0.1
@@ -106,7 +109,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
     deflection_at = basis.deflection_at
     if stretch is not None:
         scale = plant.stretch * stretch.stiffness
-        sensor = _beside(sensor, stretch.strain * scale[:, None], 2)
+        sensor = _beside(sensor, (stretch.volts * scale)[:, None] * stretch.strain, 2)
         actuator = _beside(actuator, stretch.free * (scale / plant.modal_mass)[:, None], 1)
         observer, deflection_at = (_beside(x, 0.0, 2) for x in (observer, deflection_at))
     angle = 2 * jnp.pi * electronics.period * spectrum_frequencies(structure, bases)
@@ -131,6 +134,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         hysteresis=_hysteresis(structure, case),
         rest=_rest(structure, case, plant) if structure.is_linear else None,
         split=split[2],
+        strain=_strain(structure, case, basis, stretch, plant),
     )
     if change is not None:
         until = change.share * step
@@ -277,6 +281,38 @@ def _left_out_voltage(case: Case, basis: ModalBasis, mode_mask: Array = 1.0) -> 
     return lambda_s * lambda_a * static_remainder(basis, mode_mask)[0]
 
 
+def _strain(
+    structure: Structure, case: Case, basis: ModalBasis, stretch: Stretch | None, plant: Plant
+) -> tuple[Array, Array] | None:
+    """See `Loop.strain`; None: not wanted.
+
+    Of the actuators' faces, and of the sensors', which bending draws the other way; of links of
+    given length the first are enough, and beside a strain gauge there is no other.
+    """
+    if not is_accumulated("patch_strain_peak", structure.metrics):
+        return None
+    beam, patches = case.machine.beam, case.machine.patches
+    share, lambda_a = float(structure.has_static_correction), _constants(case)[1][:, None, None]
+    lever = _each_link(structure, outer_distance(beam, patches) / patches.sensor_length)
+    by_q = lever * jnp.swapaxes(basis.sensor_slope, 1, 2)
+    by_voltage = lever * share * lambda_a * static_remainder(basis)[0]
+    if stretch is None:
+        return by_q, by_voltage
+    other = _each_link(structure, 2 * is_alone(patches) - 1)
+
+    def faces(bent: Array, drawn: Array) -> Array:
+        return jnp.concatenate([drawn + bent, drawn + other * bent], axis=1)
+
+    tension = (plant.stretch * stretch.stiffness)[:, None]
+    by_elongation = jnp.tile(stretch.strain * tension, (1, 2))
+    return _beside(faces(by_q, 0.0), by_elongation, 2), faces(by_voltage, held_strain(stretch))
+
+
+def _each_link(structure: Structure, x: Array) -> Array:
+    """Of one number for all links or one for each, (3, 1, 1)."""
+    return jnp.broadcast_to(x, (structure.n_links,))[:, None, None]
+
+
 def left_out_deflection(case: Case, basis: ModalBasis) -> Array:
     """Deflection at the stations that the actuators give modes beyond `basis` [m/V], (3, S, K)."""
     return _constants(case)[1][:, None, None] * static_remainder(basis)[1]
@@ -389,7 +425,8 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
     )
     stretch = stretch_of(structure._replace(basis=structure.controller_basis), case)
     if stretch is not None:  # below longitudinal modes links lengthen freely
-        nominal = nominal._replace(feedthrough=nominal.feedthrough + stretch.local)
+        local = stretch.volts[:, None, None] * stretch.local
+        nominal = nominal._replace(feedthrough=nominal.feedthrough + local)
     law = LAWS[structure.law]
     feedback = law.design(structure, case, nominal)
     sizes = structure.n_links, n_channels(structure), structure.n_patches

@@ -241,6 +241,7 @@ def _machine(numbers: Numbers, structure: Structure, xp: Any) -> Machine:
             hysteresis=number("patches.hysteresis"),
             is_force=1.0 * number("link.stretch"),
             is_paired=1.0 * number("patches.actuators"),
+            strain_limit=number("patches.strain_limit"),
         ),
         damping=_damping(numbers, xp),
     )
