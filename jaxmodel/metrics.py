@@ -163,13 +163,8 @@ def zero_totals(sizes: Sizes, dtype: Any, names: tuple[str, ...] = ()) -> Totals
         shape = tuple(sizes.axes[name] for name in total.dims)
         return jax.tree.map(lambda start: jnp.full(shape, start, dtype), total.start)
 
-    selected = (METRICS[name] for name in METRICS if is_accumulated(name, names))
-    return {total.name: begin(total) for metric in selected for total in metric.totals}
-
-
-def is_accumulated(name: str, names: tuple[str, ...]) -> bool:
-    """Whether runs with these metrics, () for all, accumulate one."""
-    return name in ({*names, *ALWAYS} if names else METRICS)
+    selected = {*names, *ALWAYS} if names else METRICS
+    return {x.name: begin(x) for name in METRICS if name in selected for x in METRICS[name].totals}
 
 
 def accumulate(totals: Totals, instant: Instant) -> Totals:

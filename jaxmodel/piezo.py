@@ -113,19 +113,16 @@ def sensor_gain(patches: Patches) -> Array:
     return jnp.where(jnp.asarray(patches.is_gauge) > 0, gauge, piezo)
 
 
-def outer_distance(beam: Beam, patches: Patches) -> Array:
-    """Distance of a ceramic's outer face from the neutral axis at the centre of its pair [m].
+def outer_faces(beam: Beam, patches: Patches) -> tuple[Array, Array]:
+    """Heights of the ceramics' outer faces over the neutral axis at the centre of a pair [m].
 
-    t_b/2 + t_p with ceramic on both faces; an actuator opposite to a strain gauge is alone and
-    draws the neutral axis towards itself by z_n.
+    Of the actuator's and the opposite one, t_b/2 + t_p and its negative. An actuator opposite to a
+    strain gauge is alone and draws the neutral axis towards itself: twice t_b/2 + t_p - z_n.
     """
-    shift = one_sided_section(beam, patches).neutral_axis * is_alone(patches)
-    return beam.thickness / 2 + patches.thickness - shift
-
-
-def is_alone(patches: Patches) -> Array:
-    """1 where only one face has ceramic at the centre of a pair, else 0."""
-    return patches.is_gauge * (1 - patches.is_paired)
+    is_alone = patches.is_gauge * (1 - patches.is_paired)
+    shift = one_sided_section(beam, patches).neutral_axis * is_alone
+    height = beam.thickness / 2 + patches.thickness - shift
+    return height, height * (2 * is_alone - 1)
 
 
 def patch_ends(center: Array, length: Array) -> tuple[Array, Array]:

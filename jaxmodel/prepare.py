@@ -28,14 +28,13 @@ from jaxmodel.laws.contract import NominalModel, check_feedback
 from jaxmodel.laws.poles import is_unplaceable
 from jaxmodel.lazy import compiled, jax, jnp
 from jaxmodel.loop import Delayed, LeftOut, Loop, Rest
-from jaxmodel.metrics import is_accumulated
+from jaxmodel.metrics import METRICS
 from jaxmodel.notch import design_notch
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import (
     actuator_constant,
     bare_stiffness,
-    is_alone,
-    outer_distance,
+    outer_faces,
     placement_faults,
     sensor_constant,
 )
@@ -289,28 +288,25 @@ def _strain(
     Of the actuators' faces, and of the sensors', which bending draws the other way; of links of
     given length the first are enough, and beside a strain gauge there is no other.
     """
-    if not is_accumulated("patch_strain_peak", structure.metrics):
+    if "patch_strain_peak" not in (structure.metrics or METRICS):
         return None
     beam, patches = case.machine.beam, case.machine.patches
+    near, far = (
+        jnp.broadcast_to(height / patches.sensor_length, (structure.n_links,))[:, None, None]
+        for height in outer_faces(beam, patches)
+    )
     share, lambda_a = float(structure.has_static_correction), _constants(case)[1][:, None, None]
-    lever = _each_link(structure, outer_distance(beam, patches) / patches.sensor_length)
-    by_q = lever * jnp.swapaxes(basis.sensor_slope, 1, 2)
-    by_voltage = lever * share * lambda_a * static_remainder(basis)[0]
+    by_q = jnp.swapaxes(basis.sensor_slope, 1, 2)
+    by_voltage = share * lambda_a * static_remainder(basis)[0]
     if stretch is None:
-        return by_q, by_voltage
-    other = _each_link(structure, 2 * is_alone(patches) - 1)
+        return near * by_q, near * by_voltage
 
-    def faces(bent: Array, drawn: Array) -> Array:
-        return jnp.concatenate([drawn + bent, drawn + other * bent], axis=1)
+    def faces(turned: Array, drawn: Array) -> Array:
+        return jnp.concatenate([drawn + near * turned, drawn + far * turned], axis=1)
 
     tension = (plant.stretch * stretch.stiffness)[:, None]
     by_elongation = jnp.tile(stretch.strain * tension, (1, 2))
     return _beside(faces(by_q, 0.0), by_elongation, 2), faces(by_voltage, held_strain(stretch))
-
-
-def _each_link(structure: Structure, x: Array) -> Array:
-    """Of one number for all links or one for each, (3, 1, 1)."""
-    return jnp.broadcast_to(x, (structure.n_links,))[:, None, None]
 
 
 def left_out_deflection(case: Case, basis: ModalBasis) -> Array:
