@@ -172,7 +172,7 @@ def test_static_volts_per_volt_are_a_closed_form(basis, stretch, rounded):
     permittivity -= patches.d31**2 * patches.youngs_modulus
     charge = push * patches.thickness / (permittivity * patches.width)
     wanted = charge * push * (height * arm / bending - stretch / (core + layers * skin))
-    loop = jax.jit(prepare, static_argnums=0)(structure, case).loop
+    loop = kept.prepared(structure, case).loop
     stiffness = loop.plant.stiffness / loop.plant.modal_mass[:, None]
     modal = jnp.einsum("ikr,irl->ikl", loop.sensor / stiffness[:, None], loop.actuator)
     found = np.asarray(modal + loop.left_out.sensor)
