@@ -59,6 +59,7 @@ class Loop(NamedTuple):
     # omega^2 [1/s2] and decay [1/s] of the elongations' oscillators in `exponential`, less those of
     # links alone, (3,) each; None: links keep their length
     split: tuple[Array, Array] | None = None
+    strain: tuple[Array, Array] | None = None  # `Sample.strain` of q [1/m] and of voltages [1/V]
 
 
 def coordinate_omega(loop: Loop) -> Array:
@@ -412,10 +413,14 @@ def step(structure: Structure, loop: Loop, state: State, inputs: Inputs) -> tupl
 def filtered_voltage(loop: Loop, plant: PlantState) -> Array:
     """Sensor voltages behind the anti-alias filter [V], (3, K)."""
     assert plant.z is not None
-    seen = jnp.sum(loop.sensor * plant.z[:, None], axis=2)
     if plant.direct_z is None or loop.left_out is None:
-        return seen
-    return seen + jnp.sum(loop.left_out.sensor * plant.direct_z[:, None], axis=2)
+        return jnp.sum(loop.sensor * plant.z[:, None], axis=2)
+    return observed(loop.sensor, loop.left_out.sensor, plant.z, plant.direct_z)
+
+
+def observed(by_q: Array, by_voltage: Array, q: Array, voltage: Array) -> Array:
+    """What coordinates show, and voltages at once, (3, n)."""
+    return jnp.sum(by_q * q[:, None], axis=2) + jnp.sum(by_voltage * voltage[:, None], axis=2)
 
 
 def advance(
@@ -512,10 +517,9 @@ def deflection(loop: Loop, q: Array, voltage: Array) -> Array:
         q: modal coordinates [m], (3, R).
         voltage: on the actuators [V], (3, K).
     """
-    modal = jnp.sum(loop.deflection_at * q[:, None], axis=2)
     if loop.left_out is None:
-        return modal
-    return modal + jnp.sum(loop.left_out.deflection * voltage[:, None], axis=2)
+        return jnp.sum(loop.deflection_at * q[:, None], axis=2)
+    return observed(loop.deflection_at, loop.left_out.deflection, q, voltage)
 
 
 def _modes(loop: Loop, q: Array) -> Array:
@@ -526,19 +530,17 @@ def _modes(loop: Loop, q: Array) -> Array:
 def _raw_voltage(loop: Loop, plant: PlantState, voltage: Array) -> Array:
     """Sensor voltages before the anti-alias filter [V], (3, K)."""
     q = plant.q if plant.s is None else plant.q - plant.s
-    seen = jnp.sum(loop.sensor * q[:, None], axis=2)
     if loop.left_out is None:
-        return seen
+        return jnp.sum(loop.sensor * q[:, None], axis=2)
     held = voltage if plant.direct_s is None else voltage - plant.direct_s
-    return seen + jnp.sum(loop.left_out.sensor * held[:, None], axis=2)
+    return observed(loop.sensor, loop.left_out.sensor, q, held)
 
 
 def _reference(inputs: Inputs, point: int, held: Array | None) -> Reference:
-    forward = None if inputs.feedforward is None else inputs.feedforward[point]
     return Reference(
         rho=inputs.rho[point],
         rho_rate=inputs.rho_rate[point],
-        feedforward=forward,
+        feedforward=None if inputs.feedforward is None else inputs.feedforward[point],
         disturbance=inputs.disturbance,
         wrench=inputs.wrench,
         held=held,
@@ -653,6 +655,7 @@ def _sample(
         is_motor_saturated=jnp.where(is_full, 1.0, 0.0).astype(voltage.dtype),
         axial_force=axial,
         stretch_error=stretch_error(rates.chain, loop.axial_compliance * axial),
+        strain=None if loop.strain is None else observed(*loop.strain, plant.q, present),
     )
 
 
@@ -671,8 +674,7 @@ def _freeze_if_bad(
         total = total + jnp.sum(part, axis=0)
     is_finite = jnp.abs(total) < jnp.inf  # false for NaN too
     # a linear machine's reach has no end
-    is_linear = loop.rest is not None
-    code = jnp.zeros_like(old.status) if is_linear else chain_status(loop.plant, chain)
+    code = chain_status(loop.plant, chain) if loop.rest is None else jnp.zeros_like(old.status)
     code = jnp.where((code == status.OK) & is_wild, float(status.DIVERGED), code)
     code = jnp.where(is_finite, code, float(status.NON_FINITE)).astype(old.status.dtype)
     is_first = (old.status == status.OK) & (code != status.OK)

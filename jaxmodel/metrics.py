@@ -37,6 +37,8 @@ class Sample(NamedTuple):
     is_motor_saturated: Array  # share of this sample with a motor at its limit, 0 or 1, ()
     axial_force: Array  # tension in the links [N], (3,)
     stretch_error: Array  # of the platform if links stretched [m, m, rad], (3,)
+    # of the ceramics' outer faces [1], (3, K or 2 K); None: `patch_strain_peak` is not accumulated
+    strain: Array
 
 
 class Window(NamedTuple):
@@ -484,6 +486,13 @@ METRICS: Table[Metric] = Table(
             "m; m; rad",
             "peak pose error that link stretching would add, N L/(E A)",
             lambda at: jnp.abs(at.sample.stretch_error),
+        ),
+        _peak(
+            "patch_strain_peak",
+            ("link",),
+            "1",
+            "largest strain of the ceramics, at the centres of the pairs",
+            lambda at: jnp.max(jnp.abs(at.sample.strain), axis=1),
         ),
         _mean(
             "plant_energy",

@@ -57,6 +57,7 @@ class Patches(NamedTuple):
     hysteresis: Array = 0.0  # width of the actuators' loop, see `jaxmodel.hysteresis` [1], ()
     sensor_factor: Array = 1.0  # true over nominal volts of each sensor [1], () or (3, K)
     actuator_factor: Array = 1.0  # true over nominal force of each actuator [1], () or (3, K)
+    strain_limit: Array = 4e-4  # tolerated strain of the ceramics [1], ()
     is_gauge: Array = 0.0  # 1: sensors are strain gauges, 0: piezo patches
     bridge: Array = 2500.0  # amplified bridge voltage per relative change of resistance [V]
     # 1: an actuator is a force at its distance from the section's own neutral axis, 0: a moment

@@ -129,6 +129,18 @@ def patch_constants(machine: Machine) -> tuple[Array, Array]:
     return lambda_s * seen, lambda_a * driven
 
 
+def outer_faces(beam: Beam, patches: Patches) -> tuple[Array, Array]:
+    """Heights of the ceramics' outer faces over the neutral axis at the centre of a pair [m].
+
+    Of the actuator's and the opposite one, t_b/2 + t_p and its negative. An actuator opposite to a
+    strain gauge is alone and draws the neutral axis towards itself: twice t_b/2 + t_p - z_n.
+    """
+    is_alone = patches.is_gauge * (1 - patches.is_paired)
+    shift = one_sided_section(beam, patches).neutral_axis * is_alone
+    height = beam.thickness / 2 + patches.thickness - shift
+    return height, height * (2 * is_alone - 1)
+
+
 def patch_ends(center: Array, length: Array) -> tuple[Array, Array]:
     """Left and right end [m] of patches of a given length [m] at `center` [m]."""
     return center - length / 2, center + length / 2

@@ -29,12 +29,13 @@ from jaxmodel.laws.contract import NominalModel, check_feedback
 from jaxmodel.laws.poles import is_unplaceable
 from jaxmodel.lazy import compiled, jax, jnp
 from jaxmodel.loop import Delayed, LeftOut, Loop, Rest
+from jaxmodel.metrics import METRICS
 from jaxmodel.notch import design_notch
 from jaxmodel.parameters import Array
-from jaxmodel.piezo import bare_stiffness, patch_constants, placement_faults
+from jaxmodel.piezo import bare_stiffness, outer_faces, patch_constants, placement_faults
 from jaxmodel.plant import Plant, build_plant, damping_ratio
 from jaxmodel.static import static_remainder
-from jaxmodel.stretch import Stretch, find_stretch, held_voltage
+from jaxmodel.stretch import Stretch, find_stretch, held_strain, held_voltage
 
 #: Frequencies of the spectra lie within this fraction of the modal frequency [1].
 SPECTRUM_SPAN = 0.1
@@ -102,7 +103,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
     deflection_at = basis.deflection_at
     if stretch is not None:
         scale = plant.stretch * stretch.stiffness
-        sensor = _beside(sensor, stretch.strain * scale[:, None], 2)
+        sensor = _beside(sensor, stretch.volts * stretch.strain * scale[:, None], 2)
         actuator = _beside(actuator, stretch.free * (scale / plant.modal_mass)[:, None], 1)
         observer, deflection_at = (_beside(x, 0.0, 2) for x in (observer, deflection_at))
     angle = 2 * jnp.pi * electronics.period * spectrum_frequencies(structure, bases)
@@ -127,6 +128,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         hysteresis=_hysteresis(structure, case),
         rest=_rest(structure, case, plant) if structure.is_linear else None,
         split=split[2],
+        strain=_strain(structure, case, basis, stretch, plant),
     )
     if change is not None:
         until = change.share * step
@@ -281,6 +283,35 @@ def _left_out_voltage(case: Case, basis: ModalBasis, mode_mask: Array = 1.0) -> 
     return lambda_s[:, :, None] * lambda_a[:, None] * static_remainder(basis, mode_mask)[0]
 
 
+def _strain(
+    structure: Structure, case: Case, basis: ModalBasis, stretch: Stretch | None, plant: Plant
+) -> tuple[Array, Array] | None:
+    """See `Loop.strain`; None: not wanted.
+
+    Of the actuators' faces, and of the sensors', which bending draws the other way; of links of
+    given length the first are enough, and beside a strain gauge there is no other.
+    """
+    if "patch_strain_peak" not in (structure.metrics or METRICS):
+        return None
+    beam, patches = case.machine.beam, case.machine.patches
+    near, far = (
+        jnp.broadcast_to(height / patches.sensor_length, (structure.n_links,))[:, None, None]
+        for height in outer_faces(beam, patches)
+    )
+    share = float(structure.has_static_correction)
+    by_q = jnp.swapaxes(basis.sensor_slope, 1, 2)
+    by_voltage = share * patch_constants(case.machine)[1][:, None] * static_remainder(basis)[0]
+    if stretch is None:
+        return near * by_q, near * by_voltage
+
+    def faces(turned: Array, drawn: Array) -> Array:
+        return jnp.concatenate([drawn + near * turned, drawn + far * turned], axis=1)
+
+    tension = (plant.stretch * stretch.stiffness)[:, None]
+    by_elongation = jnp.tile(stretch.strain * tension, (1, 2))
+    return _beside(faces(by_q, 0.0), by_elongation, 2), faces(by_voltage, held_strain(stretch))
+
+
 def left_out_deflection(case: Case, basis: ModalBasis) -> Array:
     """Deflection at the stations that the actuators give modes beyond `basis` [m/V], (3, S, K)."""
     return patch_constants(case.machine)[1][:, None] * static_remainder(basis)[1]
@@ -393,7 +424,8 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
     )
     stretch = stretch_of(structure._replace(basis=structure.controller_basis), case)
     if stretch is not None:  # below longitudinal modes links lengthen freely
-        nominal = nominal._replace(feedthrough=nominal.feedthrough + stretch.local)
+        local = stretch.volts[:, :, None] * stretch.local
+        nominal = nominal._replace(feedthrough=nominal.feedthrough + local)
     law = LAWS[structure.law]
     feedback = law.design(structure, case, nominal)
     sizes = structure.n_links, n_channels(structure), structure.n_patches

@@ -245,6 +245,7 @@ class Outline(NamedTuple):
     joint_radius: Array | None
     singularity_distance: Array  # [rad], ()
     singularity_margin: Array  # [rad], ()
+    strain_limit: Array  # [1], ()
 
 
 class Start(NamedTuple):
@@ -294,6 +295,7 @@ def begin(structure: Structure, case: Case) -> Start:
             joint_radius=_joint_radius(loop.plant),
             singularity_distance=outside.singularity_distance,
             singularity_margin=jnp.asarray(case.windows.singularity_margin),
+            strain_limit=jnp.asarray(case.machine.patches.strain_limit),
         ),
     )
 
@@ -329,6 +331,8 @@ def conclude(outline: Outline, code: Array, last: State, record: Record | None =
     miss = jnp.sqrt(error[0] ** 2 + error[1] ** 2)
     if outline.joint_radius is not None:
         miss = miss + outline.joint_radius * error[2]
+    strain = result.patch_strain_peak  # None: nobody asked
+    is_strained = False if strain is None else jnp.any(strain > outline.strain_limit)
     is_overloaded = jnp.any(result.peak_compression > outline.critical_force)
     for is_wrong, bad in (
         (is_overloaded, status.OVERLOADED),
@@ -337,6 +341,7 @@ def conclude(outline: Outline, code: Array, last: State, record: Record | None =
         (result.saturated_fraction > limit, status.SATURATED),
         (result.clipped_fraction > limit, status.CLIPPED),
         (outline.singularity_distance < outline.singularity_margin, status.NEAR_SINGULAR),
+        (is_strained, status.STRAINED),
     ):
         final = jnp.where((final == status.OK) & is_wrong, float(bad), final)
     # zeros from a stopped run would look like perfect results

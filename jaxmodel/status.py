@@ -30,6 +30,7 @@ OVERDAMPED = 22
 UNPLACEABLE = 23
 DELAY_OFF = 24
 UNJUDGED = 25
+STRAINED = 26
 
 #: A case with one of these statuses ran to its end, and its metrics are valid.
 FINISHED = (
@@ -42,6 +43,7 @@ FINISHED = (
     NEAR_SINGULAR,
     OVERLOADED,
     UNJUDGED,
+    STRAINED,
 )
 
 REASONS = {
@@ -73,4 +75,5 @@ REASONS = {
     "a frequency given, beyond half the sample rate, or estimates in phase",
     DELAY_OFF: "delay of the commands beyond 0 to 4 samples",
     UNJUDGED: "no verdict on stability: the linearised sampled loop is not finite",
+    STRAINED: "patches strained beyond patches.strain_limit",
 }

@@ -4,7 +4,7 @@ A patch on one face pushes with F = b_p E_p |d31| per volt, which bends its sect
 it; the sensor on the other face reads extension against bending. Longitudinal modes of a link lie
 far above the loop's, so one coordinate is enough, its elongation e. With the axial compliance
 Lambda = int dx/EA, the tension N = (e - sum_l free_l V_l)/Lambda; sensor k adds
-strain_k N + sum_l local_kl V_l to its voltage. docs/theory.md, "Patches as they are".
+volts (strain_k N + sum_l local_kl V_l) to its voltage. docs/theory.md, "Patches as they are".
 """
 
 from __future__ import annotations
@@ -30,8 +30,9 @@ class Stretch(NamedTuple):
     damping: Array  # of the rate of e, in proportion to stiffness [N s/m], (3,)
     mass: Array  # int rhoA s^2 dx with the displacement s e, s(0) = 0 and s(L) = 1 [kg], (3,)
     free: Array  # elongation per volt without tension [m/V], (3, K)
-    strain: Array  # sensor volts per newton of tension [V/N], (3, K)
-    local: Array  # sensor volts per actuator volt without tension [V/V], (3, K, K)
+    strain: Array  # mean over each sensor per newton of tension [1/N], (3, K)
+    local: Array  # the same per actuator volt without tension [1/V], (3, K, K)
+    volts: Array  # of a sensor at such a strain of 1 [V], (3, K)
 
 
 def axial_stiffness(beam: Beam, patches: Patches, pieces: Pieces, has_patches: bool) -> Array:
@@ -66,34 +67,37 @@ def find_stretch(beam: Beam, patches: Patches, damping: Damping, has_patches: bo
         end = jnp.cumsum(soft) / compliance
         start = end - soft / compliance
         line_mass = section_mass(beam, patches, pieces, has_patches)
-        # what draws a sensor out bends it the other way: it reads against the bending
-        force, volts = actuator_force(patches), -sensor_gain(patches)
+        force, seen = actuator_force(patches), pieces.has_sensor * soft / patches.sensor_length
         return (
             1 / compliance,
             jnp.sum(line_mass * width * (start**2 + start * end + end**2)) / 3,
             force * (pieces.has_actuator @ soft) * (1 - patches.is_paired),
-            volts * (pieces.has_sensor @ soft),
-            volts
-            * force
-            * (pieces.has_sensor * soft)
-            @ pieces.has_actuator.T
-            * (1 - patches.is_paired),
+            jnp.sum(seen, axis=1),
+            force * seen @ pieces.has_actuator.T * (1 - patches.is_paired),
+            # what draws a sensor out bends it the other way: it reads against the bending
+            -sensor_gain(patches) * patches.sensor_length,
         )
 
     links = by_link(beam, patches, jnp.zeros((1,)))[:2]
     seen, driven = own_factors(patches)
-    stiffness, mass, free, strain, local = jax.vmap(one_link)(*links)
+    stiffness, mass, free, strain, local, volts = jax.vmap(one_link)(*links)
     return Stretch(
         stiffness=stiffness,
         damping=2 * jnp.asarray(damping.stretch) / REFERENCE * stiffness,
         mass=mass,
         free=driven * free,
-        strain=seen * strain,
-        local=seen[:, :, None] * local * driven[:, None],
+        strain=strain,
+        local=local * driven[:, None],
+        volts=volts[:, None] * seen,
     )
 
 
 def held_voltage(stretch: Stretch) -> Array:
     """Sensor volts per actuator volt of links that cannot lengthen [V/V], (3, K, K)."""
+    return stretch.volts[:, :, None] * held_strain(stretch)
+
+
+def held_strain(stretch: Stretch) -> Array:
+    """Mean strain over the sensors per actuator volt of such links [1/V], (3, K, K)."""
     tension = stretch.free * stretch.stiffness[:, None]
     return stretch.local - stretch.strain[:, :, None] * tension[:, None]

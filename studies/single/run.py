@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+from jaxmodel import status
 from jaxmodel.metrics import METRICS
 from studies.engine.design import deviations, load_design
 from studies.engine.run_data import run_attributes, run_variables
@@ -32,7 +33,13 @@ class Replay(NamedTuple):
     @property
     def agrees(self) -> bool:
         """Whether status and numbers are those of the sweep, if there is one."""
-        return self.stored_status in (None, self.run.status) and not self._faults
+        return self.stored_status in (None, self._status) and not self._faults
+
+    @property
+    def _status(self) -> int:
+        """Of this run; a sweep that does not keep the strain of patches does not warn of it."""
+        is_unknown = "patch_strain_peak" not in self.differences
+        return status.OK if is_unknown and self.run.status == status.STRAINED else self.run.status
 
     @property
     def _faults(self) -> list[str]:
@@ -47,7 +54,7 @@ class Replay(NamedTuple):
         """The comparison in sentences; [] if there is nothing to compare with."""
         if self.stored_status is None:
             return []
-        is_same = self.stored_status == self.run.status
+        is_same = self.stored_status == self._status
         ends = [] if is_same else ["CAUTION: the sweep and this run end differently."]
         metrics = {name: x for name, (x, _) in self.differences.items() if name in METRICS}
         worst = max(metrics, key=metrics.__getitem__, default="")

@@ -72,6 +72,7 @@ _REMEDIES = {
     status.MOTORS_SATURATED: "move more slowly (motion.move_time), or raise drive.force_limit",
     status.NOT_ARRIVED: "let the run and its window begin later (metrics.residual_delay), or "
     "stiffen the drive (drive.kp)",
+    status.STRAINED: "move more slowly (motion.move_time), or lower electronics.voltage_limit",
 }
 
 

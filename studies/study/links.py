@@ -181,3 +181,10 @@ class PatchesSection(Section):
         le=WIDEST,
         free=MACHINE,
     )
+    strain_limit: float = described(
+        4e-4,
+        "1",
+        "tolerated strain of the ceramics, which crack in tension (metric patch_strain_peak)",
+        gt=0,
+        le=0.1,
+    )

@@ -55,6 +55,7 @@ LABELS = {
     "peak_tension": ("N", "link"),
     "peak_compression": ("N", "link"),
     "stretch_error_peak": ("m; m; rad", "pose_axis"),
+    "patch_strain_peak": ("1", "link"),
     "plant_energy": ("m2/s2", "link mode"),
     "modal_energy": ("m2/s2", "link controlled_mode"),
     "spectral_density": ("m2/Hz", "link controlled_mode spectrum_point"),
@@ -108,6 +109,7 @@ def by_definition(run):
         "peak_tension": np.maximum(run.axial_force.max(axis=0), 0),
         "peak_compression": np.maximum((-run.axial_force).max(axis=0), 0),
         "stretch_error_peak": peak(run.stretch_error),
+        "patch_strain_peak": peak(run.strain).max(axis=1),
         "plant_energy": energy(run.q, run.q_rate, run.omega),
         "modal_energy": modal_energy,
         "spectral_density": periodogram(run.modal, 1 / period, run.frequency),
@@ -190,6 +192,7 @@ def made_up(seed):
         is_motor_saturated=flags(),
         axial_force=signal() + np.array([0.5, -0.2, 0.0]),
         stretch_error=signal(),
+        strain=signal(6),
     )
 
 
@@ -330,6 +333,31 @@ STUDY = short_study(
 STRUCTURE = build_structure(STUDY)
 
 
+def strain_of_sines(study, run):
+    """On the faces of a bare link's patches, by its sines and the exact rest, (n, 3, K).
+
+    An actuator bends the link by V lambda_a/(E I) between its own ends, of which two sines have
+    some; ceramics are curved like the link, and further out.
+    """
+    beam, patches = study.link, study.patches
+    center, thick = np.array(patches.centers), patches.thickness
+    wave = np.arange(1, beam.modes + 1) * np.pi / beam.length
+
+    def slopes(size):
+        at = center[:, None] + np.array([-size, size]) / 2
+        return np.diff(wave * np.cos(wave * at[..., None]), axis=1)[:, 0]
+
+    seen, driven = slopes(patches.sensor_length), slopes(patches.actuator_length)
+    softness = 12 / (beam.youngs_modulus * beam.width * beam.thickness**3)
+    core, skin = (one.youngs_modulus * one.width * one.thickness for one in (beam, patches))
+    push = patches.width * patches.youngs_modulus * abs(patches.d31)
+    moment = push * (beam.thickness + thick) / 2 * core / (core + skin)
+    compliance = softness * 2 / beam.length / wave**4
+    rest = patches.sensor_length * softness * np.eye(len(center)) - seen * compliance @ driven.T
+    turned = run.modal_coordinate @ seen.T + run.actuator_voltage @ (moment * rest).T
+    return (beam.thickness / 2 + thick) * turned / patches.sensor_length
+
+
 @pytest.fixture(scope="module")
 def limited():
     """Metrics of the run, and its signals."""
@@ -365,6 +393,7 @@ def limited():
         is_motor_saturated=np.any(force > limit - 1e-6, axis=1),
         axial_force=axial,
         stretch_error=stretch,
+        strain=strain_of_sines(STUDY, record),
         controller=loop.controller,
     )
 

@@ -1,6 +1,7 @@
 """Patches as they are: they stiffen links and lengthen them, against two independent codes."""
 
 from functools import cache, partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,14 +12,18 @@ from jaxmodel import sampled_loop
 from jaxmodel.frequency_response import IMAGES, image_weights, plant_images, plant_response
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import closed_loop, sampled_plant
+from jaxmodel.simulate import begin, simulate
 from jaxmodel.stretch import find_stretch, held_voltage
 from studies.engine.margins import judge_loops
+from studies.engine.runs import run_study
 from studies.engine.stability import gain_margin, loop_report, with_margin_modes
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.files import READY
 from studies.study.spec import load_study, parse_study
 from tests import DATA
+from tests.canonical import HOME
 from tests.elements import plant_of_elements
+from tests.jaxmodel import kept
 
 #: Gain margin and frequency of breaking by finite elements and by Exudyn, and damping of mode 1:
 #: of the controller with the paper's basis and half the paper's gains (model.md of the order, 4d).
@@ -167,7 +172,7 @@ def test_static_volts_per_volt_are_a_closed_form(basis, stretch, rounded):
     permittivity -= patches.d31**2 * patches.youngs_modulus
     charge = push * patches.thickness / (permittivity * patches.width)
     wanted = charge * push * (height * arm / bending - stretch / (core + layers * skin))
-    loop = jax.jit(prepare, static_argnums=0)(structure, case).loop
+    loop = kept.prepared(structure, case).loop
     stiffness = loop.plant.stiffness / loop.plant.modal_mass[:, None]
     modal = jnp.einsum("ikr,irl->ikl", loop.sensor / stiffness[:, None], loop.actuator)
     found = np.asarray(modal + loop.left_out.sensor)
@@ -175,6 +180,196 @@ def test_static_volts_per_volt_are_a_closed_form(basis, stretch, rounded):
     np.testing.assert_allclose(wanted, rounded, rtol=3e-3)
     if stretch and layers:
         np.testing.assert_allclose(wanted, ELASTICITY, rtol=0.06)
+
+
+# --- strain of the ceramics -----------------------------------------------------------------------
+
+
+class Section(NamedTuple):
+    """A link between the ends of its patches."""
+
+    axial: float  # E A [N]
+    axis: float  # height of the neutral axis over the middle [m]
+    bending: float  # E I about it [N m2]
+
+
+def section_of(study, faces):
+    """With ceramic on some faces, 1 for the actuator's and -1 for the other, by its layers."""
+    beam, patches = study.link, study.patches
+    half, top = beam.thickness / 2, beam.thickness / 2 + patches.thickness
+    layers = [(beam.youngs_modulus * beam.width, -half, half)]
+    layers += [
+        (patches.youngs_modulus * patches.width, *sorted((side * half, side * top)))
+        for side in faces
+    ]
+    axial, first, second = (
+        sum(e * (high**n - low**n) / n for e, low, high in layers) for n in (1, 2, 3)
+    )
+    return Section(axial, first / axial, second - first**2 / axial)
+
+
+class Ceramics(NamedTuple):
+    """How a pair bends and lengthens its centre."""
+
+    section: Section  # there
+    push: float  # axial force of its actuators [N/V]
+    moment: float  # [N m/V]
+    faces: np.ndarray  # heights of the ceramics' outer faces over the neutral axis [m]
+
+
+def ceramics_of(study):
+    """Of a machine as it is, or of the paper's: moments as if no sensor were opposite."""
+    patches = study.patches
+    is_paired, is_gauge = patches.actuators == "both faces", patches.sensor == "strain_gauge"
+    faces = [1, -1] if is_paired or not is_gauge else [1]
+    alone = section_of(study, [1, -1] if is_paired else [1])
+    real = section_of(study, faces)
+    own = real if study.link.basis == "loaded" else section_of(study, [])
+    axis = (real if study.link.stretch and own is real else alone).axis
+    push = patches.width * patches.youngs_modulus * abs(patches.d31)
+    middle = (study.link.thickness + patches.thickness) / 2
+    return Ceramics(
+        section=own,
+        push=0.0 if is_paired else push,
+        moment=push * (2 * middle if is_paired else middle - axis),
+        faces=np.array(faces) * (study.link.thickness / 2 + patches.thickness) - real.axis,
+    )
+
+
+BOTH, GAUGES = {"actuators": "both faces"}, {"sensor": "strain_gauge"}
+
+
+@pytest.mark.parametrize(
+    ("basis", "stretch", "patches"),
+    [
+        ("pinned_pinned", False, {}),
+        ("pinned_pinned", True, {}),
+        ("pinned_pinned", True, GAUGES),
+        ("loaded", False, {}),
+        ("loaded", True, {}),
+        ("loaded", True, GAUGES),
+        ("loaded", True, BOTH),
+        ("loaded", True, BOTH | GAUGES),
+    ],
+)
+def test_a_voltage_strains_its_own_pair_as_beam_theory_says(basis, stretch, patches):
+    """A link between joints bends and lengthens where it is driven: V M/(E I) and V F/(E A)."""
+    study = study_of(basis, stretch).change(**{f"patches__{k}": x for k, x in patches.items()})
+    loop = jax.tree.map(np.asarray, kept.prepared(*kept.arrays(study)).loop)
+    by_q, by_voltage = loop.strain
+    compliance = loop.plant.modal_mass[:, None] / loop.plant.stiffness
+    settled = by_q @ (compliance[..., None] * loop.actuator) + by_voltage
+    pair = ceramics_of(study)
+    drawn = stretch * pair.push / pair.section.axial
+    strains = drawn + pair.faces * pair.moment / pair.section.bending
+    largest = np.abs(settled.reshape(3, -1, 3, 3)).max(axis=1)
+    wanted = np.abs(strains).max() * np.eye(3)
+    np.testing.assert_allclose(largest, np.tile(wanted, (3, 1, 1)), rtol=1e-9, atol=1e-15)
+    if basis == "loaded" and stretch and not patches:
+        np.testing.assert_allclose(100 * largest.max(), 2.707e-5, rtol=1e-3)  # by 100 V
+
+
+#: The default machine's fast move, 10 mm in 30 ms.
+FAST = {
+    "run": {"duration": 0.05},
+    "motion": {"waypoints": [HOME, [0.0, 0.01, HOME[2]]], "move_time": 0.03},
+    "metrics": {"residual_delay": 0.0, "residual_length": 0.015},
+}
+
+
+@pytest.fixture(scope="module")
+def fast_move():
+    return run_study(parse_study(FAST), has_record=True, has_loop=False)
+
+
+def elongations(study, record, shortening):
+    """How much longer each link is than without load, from poses and sliders [m], (n, 3).
+
+    Its chord is by bending, q S q/2, shorter.
+    """
+    drawing = build_case(study).machine.geometry
+    guide = np.array([2 * np.pi / 3, 4 * np.pi / 3, 0.0])
+    along, across = (np.stack([np.cos(x), np.sin(x)], axis=-1) for x in (guide, guide + np.pi / 2))
+    angle = record.pose[:, 2:] + drawing.joint_angle
+    arm = drawing.joint_radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    joint = record.pose[:, None, :2] + arm
+    far, high = np.sum(joint * along, axis=-1) + 0.3, np.sum(joint * across, axis=-1) + 0.3 / 3**0.5
+    chord = np.hypot(far - record.slider, high)
+    q = record.modal_coordinate
+    return chord - study.link.length + np.einsum("tij,ijk,tik->ti", q, shortening, q) / 2
+
+
+def test_the_fast_move_strains_ceramics_as_its_trajectory_says(fast_move):
+    """From modes, voltages, poses and sliders of the record, by sections of layers."""
+    study, record = fast_move.study, fast_move.result.record
+    beam, patches, pair = study.link, study.patches, ceramics_of(study)
+    basis = jax.tree.map(np.asarray, kept.bases_of(*kept.arrays(study)).plant)
+    seen, driven, volts = basis.sensor_slope, basis.actuator_slope, record.actuator_voltage
+    # a voltage bends its own pair, of which the modes have some
+    alone, bare = section_of(study, [1]), section_of(study, [])
+    unit = pair.push * ((beam.thickness + patches.thickness) / 2 - alone.axis)
+    rest = pair.moment / pair.section.bending * patches.sensor_length * np.eye(3)
+    rest = rest - unit * np.einsum("ijk,ij,ijl->ikl", seen, 1 / basis.stiffness, driven)
+    turned = np.einsum("tij,ijk->tik", record.modal_coordinate, seen)
+    turned = turned + np.einsum("ikl,til->tik", rest, volts)
+    # tension, of springs in series: pairs, actuators beside their sensors, and the bare link
+    under, beside = patches.sensor_length, patches.actuator_length - patches.sensor_length
+    driven = under / pair.section.axial + beside / alone.axial
+    whole = 3 * driven + (beam.length - 3 * patches.actuator_length) / bare.axial
+    shortening = basis.mixed_shortening + basis.shortening[..., None] * np.eye(beam.modes)
+    drawn = elongations(study, record, shortening) - pair.push * driven * volts.sum(axis=2)
+    drawn = ((drawn / whole)[..., None] + pair.push * volts) / pair.section.axial
+    bent = pair.faces[0] * turned / patches.sensor_length
+    wanted = (np.abs(bent) + np.abs(drawn)).max(axis=(0, 2))
+    found = fast_move.result.metrics.patch_strain_peak
+    np.testing.assert_allclose(found, wanted, rtol=1e-9)
+    assert np.abs(drawn).max() > 0.05 * wanted.max()
+    np.testing.assert_allclose(found.max(), 7.208e-5, rtol=1e-3)
+
+
+def test_a_run_that_is_not_asked_for_strain_does_not_work_it_out():
+    study = parse_study(FAST)
+    structure, case = build_structure(study), build_case(study)
+
+    def strain(*metrics):
+        start = jax.eval_shape(partial(begin, structure._replace(metrics=metrics)), case)
+        return start.loop.strain, "patch_strain_peak" in start.state.totals
+
+    assert strain("residual_rms") == (None, False)
+    assert strain("patch_strain_peak")[0] is not None and strain()[1]
+
+
+@pytest.mark.long  # in short: peaks of other signals, in test_gradients
+def test_slopes_of_strain_are_those_of_differences():
+    """By the drives' stiffness, and the thickness of links and of patches."""
+    study = parse_study(FAST).change(
+        link__modes=2,
+        control__modes=2,
+        run__smooth=True,
+        run__duration=0.02,
+        run__substeps=2,
+        motion__move_time=0.01,
+        metrics__residual_length=0.005,
+    )
+    structure, case = kept.arrays(study)
+    structure = structure._replace(metrics=("patch_strain_peak",))
+
+    @jax.jit
+    def strain(shares):
+        kp, thick, patch = 1 + shares
+        beam, patches = case.machine.beam, case.machine.patches
+        machine = case.machine._replace(
+            beam=beam._replace(thickness=thick * beam.thickness),
+            patches=patches._replace(thickness=patch * patches.thickness),
+        )
+        changed = case._replace(machine=machine, drive=case.drive._replace(kp=kp * case.drive.kp))
+        return 1e5 * simulate(structure, changed).metrics.patch_strain_peak
+
+    slope, step = jax.jit(jax.jacfwd(strain))(np.zeros(3)), 1e-5
+    wanted = [(strain(by) - strain(-by)) / (2 * step) for by in step * np.eye(3)]
+    size = np.abs(slope).max(axis=0)
+    assert np.all(size > 0.01)
+    np.testing.assert_allclose(slope / size, np.transpose(wanted) / size, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", KINDS)

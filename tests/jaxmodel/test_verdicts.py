@@ -18,14 +18,15 @@ from studies.engine.runs import judged_status
 def test_every_status_has_a_number_and_a_reason_of_its_own():
     """Numbers stand in files: none may change."""
     codes = [x for name, x in vars(status).items() if name.isupper() and isinstance(x, int)]
-    assert codes == list(range(26)) == list(status.REASONS)
-    assert len(set(status.REASONS.values())) == 26
+    assert codes == list(range(27)) == list(status.REASONS)
+    assert len(set(status.REASONS.values())) == 27
     assert len(set(status.REASONS.values())) == len(codes)
 
 
 # --- how a run ends -------------------------------------------------------------------------------
 
 LIMIT, TOLERANCE, CRITICAL, MARGIN, RADIUS = 0.05, 1e-3, (30.0, 20.0, 25.0), 0.1, 0.07
+STRAIN = 5e-4
 
 
 def ended(start=status.OK, last=status.OK, distance=1.0, **found):
@@ -50,6 +51,7 @@ def ended(start=status.OK, last=status.OK, distance=1.0, **found):
         joint_radius=RADIUS,
         singularity_distance=distance,
         singularity_margin=MARGIN,
+        strain_limit=STRAIN,
     )
     last = SimpleNamespace(totals=None, status=jnp.asarray(float(last)), bad_time=0.75)
     with pytest.MonkeyPatch.context() as patch:
@@ -72,6 +74,7 @@ LIMITS = [
     ({"clipped_fraction": LIMIT}, status.CLIPPED),
     ({"motor_saturated_fraction": LIMIT}, status.MOTORS_SATURATED),
     *(({"peak_compression": np.eye(3)[i] * CRITICAL[i]}, status.OVERLOADED) for i in range(3)),
+    *(({"patch_strain_peak": STRAIN * np.eye(3)[i]}, status.STRAINED) for i in range(3)),
 ]
 
 
@@ -102,13 +105,14 @@ def test_what_explains_the_rest_comes_first():
         assert ended(distance=0.0, **bad).status == code
         del bad[name]
     assert ended(distance=0.0, **bad).status == status.NEAR_SINGULAR
+    assert ended(**bad).status == status.STRAINED
 
 
 @pytest.mark.parametrize("code", sorted(status.REASONS))
 def test_only_finished_runs_have_metrics(code):
     found = ended(last=code, saturated_fraction=1.0)
     assert found.status == (status.SATURATED if code == status.OK else code)
-    has_metrics = code in (0, 5, 10, 16, 18, 19, 20, 21, 25)
+    has_metrics = code in (0, 5, 10, 16, 18, 19, 20, 21, 25, 26)
     assert np.all(np.isfinite(found.metrics.residual_rms)) == has_metrics
     # the time of a fault is the loop's, or where it was known beforehand the command's
     assert found.bad_time == 0.75
@@ -119,7 +123,7 @@ def test_only_finished_runs_have_metrics(code):
 @pytest.mark.parametrize("code", sorted(status.REASONS))
 def test_an_unstable_loop_is_the_status_of_what_finished(code):
     assert judged_status(code, SimpleNamespace(is_stable=True)) == code
-    is_finished = code in (0, 5, 10, 16, 18, 19, 20, 21, 25)
+    is_finished = code in (0, 5, 10, 16, 18, 19, 20, 21, 25, 26)
     wanted = status.UNSTABLE if is_finished else code
     assert judged_status(code, SimpleNamespace(is_stable=False)) == wanted
     assert judged_status(code, None) == (status.UNJUDGED if is_finished else code)
@@ -220,6 +224,7 @@ def test_one_channel_at_its_limit_is_enough(factor, sign):
         controller=SimpleNamespace(voltage_limit=80.0),
         drive=SimpleNamespace(force_limit=np.array([10.0, 20.0, 30.0])),
         plant=SimpleNamespace(stretch=None),
+        strain=None,
         axial_compliance=np.ones(3),
         observer=np.zeros((3, 1, 2)),
     )

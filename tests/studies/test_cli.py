@@ -161,6 +161,18 @@ def test_simulate_prints_its_answer_without_a_file(short_folder, short_run, caps
     assert "written" not in out and sorted(short_folder.iterdir()) == before
 
 
+def test_simulate_warns_of_patches_that_are_strained_too_far(
+    short_folder, short_run, capsys, tmp_path
+):
+    study, peak = tmp_path / "short.toml", float(short_run.patch_strain_peak.max())
+    strained = "status: patches strained beyond patches.strain_limit\nnext step: move more slowly"
+    for factor, wanted, said in ((1.001, 0, "status: ok\n"), (0.999, 1, strained)):
+        limit = f"\n[patches]\nstrain_limit = {factor * peak}\n"
+        study.write_text((short_folder / "short.toml").read_text() + limit)
+        code, out, _ = run(capsys, "simulate", study)
+        assert code == wanted and out.startswith(said)
+
+
 def test_the_metrics_agree_with_the_trajectories(short_run):
     after = short_run.time > float(short_run.command_end) - 0.5e-4
     within = short_run.time < float(short_run.command_end) + 0.015 - 0.5e-4

@@ -310,6 +310,17 @@ def test_a_replay_that_ends_otherwise_fails(capsys, monkeypatch, stored, wanted)
     assert (code == 1 and told in text) == (stored is not None)
 
 
+@pytest.mark.parametrize("is_kept", [False, True])
+def test_a_replay_sees_strain_that_its_sweep_did_not_keep(capsys, monkeypatch, is_kept):
+    again = SimpleNamespace(study=SimpleNamespace(title="this"), status=status.STRAINED)
+    kept = SimpleNamespace(study=None, stored={"status": status.OK})
+    found = {"patch_strain_peak": (0.0, 1e-6)} if is_kept else {}
+    for name, value in (("load_design", kept), ("run_study", again), ("deviations", found)):
+        monkeypatch.setattr(single_run, name, lambda *_, value=value: value)
+    code, text, _ = run(capsys, "replay", "folder", "--case", "1")
+    assert code == is_kept and "this: patches strained beyond patches.strain_limit" in text
+
+
 @pytest.mark.parametrize("is_passed", [True, False])
 def test_a_certificate_that_is_not_passed_fails(capsys, monkeypatch, is_passed, tmp_path):
     monkeypatch.setattr(

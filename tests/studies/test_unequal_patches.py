@@ -51,6 +51,7 @@ def scaled(loop):
         sensor=S[:, :, None] * loop.sensor,
         actuator=loop.actuator * A[:, None],
         observer=None,
+        strain=(loop.strain[0], loop.strain[1] * A[:, None]),
         left_out=left_out._replace(
             sensor=S[:, :, None] * left_out.sensor * A[:, None],
             deflection=left_out.deflection * A[:, None],

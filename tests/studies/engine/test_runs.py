@@ -134,6 +134,7 @@ def test_a_sound_run_is_ok_and_says_how_far_it_stays_from_singular_poses():
             marks=pytest.mark.long,
         ),
         ({"metrics__singularity_margin": 0.5}, status.NEAR_SINGULAR),
+        ({"patches__strain_limit": 2e-5}, status.STRAINED),
     ],
 )
 def test_a_run_that_ends_badly_says_so(changes, code):

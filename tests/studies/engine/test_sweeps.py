@@ -112,6 +112,14 @@ def test_mode_counts_subsets_and_placements_share_one_compilation(mixed):
     assert len(np.unique(data["residual_rms"][:, 0, 0])) > 40
 
 
+def test_a_strained_patch_is_the_status_of_its_case_alone(tmp_path):
+    run(noisy_spec({"axes": {"patches.strain_limit": [1e-7, 4e-4, 1e-3]}}), tmp_path / "sweep")
+    data = read_sweep(tmp_path / "sweep")
+    np.testing.assert_array_equal(data["status"], [status.STRAINED, status.OK, status.OK])
+    peak = data["patch_strain_peak"]
+    assert np.all((peak > 1e-7) & (peak < 4e-4))
+
+
 def test_cases_without_a_verdict_are_not_ok(tmp_path):
     """As in a single run: their metrics hold, but no ranking takes them."""
     unjudged = mock.patch.object(chunks, "judge_loops", no_margins)

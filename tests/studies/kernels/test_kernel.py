@@ -83,6 +83,8 @@ HEAVY = {
     "link": {"modes": 2, "axial_inertia": "distributed"},
     "electronics": {"sensor_highpass_hz": 5.0, "amplifier_hz": 2e3},
 }
+#: Faces of ceramics that links bend and draw.
+AS_THEY_ARE = {"link": {"modes": 2, "basis": "loaded", "stretch": True}}
 STIFFNESSES = {"method": "random", "count": 32, "axes": {"drive.kp": {"from": 1e4, "to": 2e4}}}
 
 
@@ -96,11 +98,13 @@ STIFFNESSES = {"method": "random", "count": 32, "axes": {"drive.kp": {"from": 1e
             marks=pytest.mark.long,
         ),
         pytest.param(STIFFNESSES, HEAVY, marks=pytest.mark.long),
+        pytest.param(STIFFNESSES, AS_THEY_ARE, marks=pytest.mark.long),
         pytest.param(STIFFNESSES, OTHER_SORTS, marks=pytest.mark.long),
     ],
     ids=[
         "mixed sampled cases",
         "distributed inertia, amplifier",
+        "patches as they are",
         "strain rate, noise, friction, steps",
     ],
 )

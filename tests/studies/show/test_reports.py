@@ -251,6 +251,7 @@ def test_sentences_of_a_run_show_its_numbers(one_run):
         f"{1e6 * abs(error[:, 2]).max():.4g} µrad.",
         "the largest of the stations at 20, 50, 87.5 % of the link.",
         "Residual window: 123 ms, from 45 ms after the end of the reference trajectory.",
+        f"at the centres of the pairs: {1e6 * m.patch_strain_peak.max():.4g} µm/m of 400 µm/m",
         "stays within 2.5 µm. The run ends 400 ms after the reference trajectory.",
         "the end of the reference trajectory at 100 ms",
         f"Largest tension in a link {m.peak_tension.max():.4g} N, largest compression "

@@ -113,8 +113,8 @@ def _model_patches(structure, case):
         own.stiffness,
         own.damping,
         own.free,
-        own.strain,
-        own.local,
+        own.volts * own.strain,
+        own.volts[:, :, None] * own.local,
     )
 
 
