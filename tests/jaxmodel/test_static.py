@@ -60,7 +60,8 @@ places_of = jax.jit(station_places)
 def by_hand(case, basis, link):
     """Sensor volts and station deflections per actuator volt, piece by piece in plain Python."""
     one = jax.tree.map(lambda x: np.broadcast_to(x, (3,))[link], case.machine.beam)
-    patches = case.machine.patches._replace(center=0.0)
+    alike = {"sensor_factor": 1.0, "actuator_factor": 1.0}
+    patches = case.machine.patches._replace(center=0.0, **alike)
     patches = jax.tree.map(lambda x: float(np.broadcast_to(x, (3,))[link]), patches)
     centers, length = np.asarray(case.machine.patches.center)[link], float(one.length)
     half = patches.actuator_length / 2, patches.sensor_length / 2
