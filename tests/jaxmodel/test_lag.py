@@ -1,7 +1,6 @@
 """Motors that follow their commands late: poles, runs, responses, and what judges make of them."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -9,7 +8,6 @@ from jaxmodel.drive import late_response
 from jaxmodel.frequency_response import command_gain, controller_response, response_of_loop
 from jaxmodel.linear import linearise, mass_and_stiffness, natural_modes
 from jaxmodel.mechanisms.prrr.paper import HOME
-from jaxmodel.simulate import simulate
 from studies.engine.loop_gain import loop_gains
 from studies.engine.margins import judge_loops
 from studies.engine.programs import kept_jit
@@ -18,12 +16,9 @@ from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.study.window import _poles, settling_time
 from studies.twin.compare import check_supported
-from studies.verify.loops import _release
 from tests.bare import parse_study
 from tests.jaxmodel.kept import arrays, loop_at, plant_at, prepared
 from tests.jaxmodel.test_drives import MOVE, study_of
-from tests.studies.kernels.test_kernel import both, check_equal
-from tests.sweeps import small_spec
 
 LAGS = {0.0: 0.477, 1e-3: 0.337, 2e-3: 0.054}
 PD = np.array([[2e4, 60.0, 0.0], [0.0, 0.0, 0.0]])
@@ -63,13 +58,22 @@ def parts(lag, **changes):
     return structure, case, prepared(structure, case).loop
 
 
-@pytest.mark.parametrize(("lag", "wanted"), [(1e-3, 0.337), (2e-3, 0.054)])
+@pytest.mark.parametrize(
+    ("lag", "wanted"), [(2e-3, 0.054), pytest.param(1e-3, 0.337, marks=pytest.mark.long)]
+)
 def test_modes_of_the_flexible_machine_lose_as_much_and_its_run_decays_so(lag, wanted):
     structure, case, loop = parts(lag)
     plant = jax.tree.map(np.asarray, _linearise(structure, loop, np.array(HOME)))
     modes = natural_modes(plant)
     assert len(modes.frequency) == 9  # without those of the motors
     assert modes.damping_ratio[0] == pytest.approx(wanted, rel=0.03)
+    prompt = parts(0.0)[2]
+    for one, other in zip(
+        _matrices(loop, np.array(HOME), plant),
+        _matrices(prompt, np.array(HOME), _linearise(*parts(0.0)[::2], np.array(HOME))),
+        strict=True,
+    ):
+        np.testing.assert_allclose(one, other, atol=1e-9 * np.abs(other).max())
     kicked = parse_study(MOVE).change(
         drive__lag=lag,
         drive__pulse_force=(5.0, -2.5, -2.5),
@@ -87,23 +91,8 @@ def test_modes_of_the_flexible_machine_lose_as_much_and_its_run_decays_so(lag, w
     assert drop / np.hypot(1, drop) == pytest.approx(modes.damping_ratio[0], rel=0.02)
 
 
-def test_inertia_and_stiffness_do_not_know_the_lag():
-    found = []
-    for lag in (0.0, 1e-3):
-        structure, _, loop = parts(lag)
-        plant = _linearise(structure, loop, np.array(HOME))
-        found.append(_matrices(loop, np.array(HOME), plant))
-    for one, other in zip(*found, strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-9 * np.abs(one).max())
-
-
-@pytest.mark.parametrize("name", ["pd", "disturbance_observer"])
-def test_a_run_of_a_release_is_that_of_the_linear_loop(name):
-    assert _release(study_of(name, drive__lag=1e-3)).difference < 1e-3
-
-
 def test_frequency_responses_are_those_of_the_sampled_plant():
-    structure, case, loop = parts(1e-3, link__stretch=True, link__basis="loaded")
+    structure, case, loop = parts(1e-3)
     response = jax.jit(response_of_loop, static_argnums=0)(structure, case, loop, np.array(HOME))
     plant = plant_at(structure, case, np.array(HOME))
     fast = loop_gains(jax.tree.map(lambda x: np.asarray(x)[None], response))
@@ -131,25 +120,6 @@ def test_margins_of_a_batch_are_those_of_single_loops():
         own = case._replace(drive=case.drive._replace(lag=lag))
         one = loop_report(structure, own, np.array(HOME), structure.n_controlled)
         assert margin == pytest.approx(float(one.gain_margin), rel=1e-6)
-
-
-def test_machine_code_equals_scan_with_and_without_lag():
-    axes = {"drive.lag": [0.0, 2e-4, 1e-3]}
-    fast, reference = both(small_spec({"axes": axes}, link={"modes": 2}))
-    check_equal(fast, reference)
-    assert len(np.unique(reference.metrics.pose_error_peak[:, 1])) == 3
-
-
-def test_derivative_equals_differences():
-    structure, case = arrays(study_of("pd", drive__lag=1e-3, run__smooth=True))
-
-    def error(lag):
-        drive = case.drive._replace(lag=lag)
-        return jnp.max(simulate(structure, case._replace(drive=drive)).metrics.residual_rms)
-
-    value, slope = jax.jit(error), float(jax.jit(jax.jacfwd(error))(1e-3))
-    up, down = value(1e-3 + 1e-7), value(1e-3 - 1e-7)
-    assert slope == pytest.approx(float(up - down) / 2e-7, rel=1e-5) and slope != 0
 
 
 def test_the_window_waits_and_what_does_not_know_it_says_so():

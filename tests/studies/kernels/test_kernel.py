@@ -82,6 +82,8 @@ OTHER_SORTS = {
 HEAVY = {
     "link": {"modes": 2, "axial_inertia": "distributed"},
     "electronics": {"sensor_highpass_hz": 5.0, "amplifier_hz": 2e3},
+    "machine": {"joint_friction": 1e-4, "joint_friction_speed": 0.1},
+    "drive": {"lag": 1e-3},
 }
 #: Faces of ceramics that links bend and draw.
 AS_THEY_ARE = {"link": {"modes": 2, "basis": "loaded", "stretch": True}}
@@ -103,7 +105,7 @@ STIFFNESSES = {"method": "random", "count": 32, "axes": {"drive.kp": {"from": 1e
     ],
     ids=[
         "mixed sampled cases",
-        "distributed inertia, amplifier",
+        "distributed inertia, amplifier, joints that rub, motors that lag",
         "patches as they are",
         "strain rate, noise, friction, steps",
     ],

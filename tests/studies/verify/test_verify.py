@@ -402,9 +402,16 @@ def test_a_fault_fails_its_row():
     ]
 
 
-def test_figures_of_others_hold_whatever_the_study():
-    rows = outside.check_outside(None)
-    assert len(rows) == 11 and all(row.is_passed for row in rows), rows
+@pytest.mark.parametrize(
+    ("check", "count"),
+    [
+        (lambda _: outside._frequencies(), 3),
+        pytest.param(outside.check_outside, 11, marks=pytest.mark.long),
+    ],
+)
+def test_figures_of_others_hold_whatever_the_study(check, count):
+    rows = check(None)
+    assert len(rows) == count and all(row.is_passed for row in rows), rows
 
 
 @pytest.mark.long
