@@ -348,6 +348,16 @@ _MODAL_ENERGY = _summed(
 )
 
 
+def _fraction(name: str, what: str) -> Metric:
+    """Share of samples with something that a field of them says."""
+
+    def read(at: Instant) -> Array:
+        return getattr(at.sample, f"is_{name}")
+
+    text = f"samples with {what}"
+    return _mean(f"{name}_fraction", (), "1", text, _COUNT, read, is_differentiable=False)
+
+
 def _in_window(
     name: str, dims: tuple[str, ...], what: str, read: Callable[[Instant], Array]
 ) -> list[Metric]:
@@ -424,24 +434,8 @@ METRICS: Table[Metric] = Table(
             lambda at: jnp.max(jnp.abs(at.sample.voltage), axis=1),
             is_single=False,
         ),
-        _mean(
-            "saturated_fraction",
-            (),
-            "1",
-            "samples with an actuator at its limit",
-            _COUNT,
-            lambda at: at.sample.is_saturated,
-            is_differentiable=False,
-        ),
-        _mean(
-            "clipped_fraction",
-            (),
-            "1",
-            "samples with a clipped ADC channel",
-            _COUNT,
-            lambda at: at.sample.is_clipped,
-            is_differentiable=False,
-        ),
+        _fraction("saturated", "an actuator at its limit"),
+        _fraction("clipped", "a clipped ADC channel"),
         Metric(
             "control_energy",
             (),
@@ -457,15 +451,7 @@ METRICS: Table[Metric] = Table(
             "peak motor force",
             lambda at: jnp.abs(at.sample.motor_force),
         ),
-        _mean(
-            "motor_saturated_fraction",
-            (),
-            "1",
-            "samples with a motor at its limit",
-            _COUNT,
-            lambda at: at.sample.is_motor_saturated,
-            is_differentiable=False,
-        ),
+        _fraction("motor_saturated", "a motor at its limit"),
         _peak(
             "peak_tension",
             ("link",),

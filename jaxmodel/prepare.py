@@ -542,10 +542,7 @@ def _static_status(
             _is_too_fast(structure, case, bases) | jnp.any(mode_step > MODE_STEP_LIMIT),
             status.TOO_FAST,
         ),
-        (
-            stiff > STIFFNESS_LIMIT,
-            status.TOO_STIFF,
-        ),
+        (stiff > STIFFNESS_LIMIT, status.TOO_STIFF),
         (jnp.any(zeta >= 1), status.OVERDAMPED),
         (_has_unplaceable_poles(structure, case, design), status.UNPLACEABLE),
         (_is_delay_off(structure, case), status.DELAY_OFF),

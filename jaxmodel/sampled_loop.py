@@ -242,11 +242,7 @@ def delayed_parts(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
     smooth, drive = structure._replace(has_delay=True, is_smooth=True), DRIVES[structure.drive]
     plant = linearise(smooth, loop, pose, resting(smooth, case), drive.is_sampled)
     analogue = analogue_plant(smooth, plant, case)
-    count, n_sensors, dtype = (
-        len(analogue.state),
-        structure.n_sensors,
-        analogue.state.dtype,
-    )
+    count, n_sensors, dtype = len(analogue.state), structure.n_sensors, analogue.state.dtype
     below = jnp.pad(_queue(n_sensors, dtype), ((count, 0), (count, 0)))
     unmoved = jnp.zeros((len(below), structure.n_links), dtype)
     exact = _Sampled(held=below, newest=None, force=unmoved, present=unmoved)
@@ -579,10 +575,8 @@ def spillover(structure: Structure, case: Case, matrices: LoopMatrices) -> Array
         return jnp.diagonal(gramian.share)[first:last], gramian
 
     # the plant's states and those of a sampled drive; electronics do not act back on them
-    size, drive = (
-        matrices.open.shape[0],
-        resting_drive(DRIVES[structure.drive], jnp.zeros((structure.n_links,))),
-    )
+    size = matrices.open.shape[0]
+    drive = resting_drive(DRIVES[structure.drive], jnp.zeros((structure.n_links,)))
     count = sum(x.size for x in jax.tree.leaves(drive))
     kept = np.r_[0 : 2 * last - first + structure.n_motors, size - count : size]
     plant = matrices.open[np.ix_(kept, kept)]

@@ -117,10 +117,8 @@ def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
     """
     right, left = _eigenvectors(loop.open + factor * loop.feedback, pole)
     n, r = loop.omega.shape
-    first, last = (
-        2 * n,
-        2 * n + 2 * n * r,
-    )  # the rest is sensors behind their filters, the controller, and the drive
+    # the rest is sensors behind their filters, the controller, and the drive
+    first, last = 2 * n, 2 * n + 2 * n * r
     share = left * right
     parts = (share[loop.is_drive], share[first:last], share[last:][~loop.is_drive[last:]])
     drive, links, filters = (abs(part.sum()) for part in parts)
