@@ -12,6 +12,7 @@ from scipy.integrate import cumulative_simpson
 
 from jaxmodel.joints import joint_decay, rub
 from jaxmodel.kinematics import link_direction
+from jaxmodel.loop import PlantState
 from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.plant import build_plant
 from jaxmodel.prepare import STIFFNESS_LIMIT
@@ -24,7 +25,6 @@ from tests import forms
 from tests.bare import parse_study
 from tests.jaxmodel.kept import arrays, loop_at, prepared
 from tests.jaxmodel.test_integrator import SAMPLE, energies, run
-from tests.jaxmodel.test_mechanism_motion import at_home
 from tests.jaxmodel.test_mechanisms import MACHINES, states
 
 #: Strong and slow enough that friction changes every acceleration [N m], [rad/s].
@@ -33,11 +33,15 @@ STRONG = {"joint_friction": 5.0, "joint_friction_speed": 2.0}
 SMOOTH = {"machine__joint_friction": 2e-3, "machine__joint_friction_speed": 0.5}
 
 
+_built = jax.jit(partial(build_plant, has_joint_friction=True))
+_chain = jax.jit(lagrangian.modal_chain)
+
+
 def accelerations(name):
     """By the reduced equations and by the Lagrangian, of joints that rub."""
     machine = (MACHINES | {"prrr": forms.MACHINE})[name]._replace(**STRONG)
     basis, _ = forms.make("pinned_pinned", machine)
-    plant = jax.tree.map(np.asarray, build_plant(machine, basis, has_joint_friction=True))
+    plant = jax.tree.map(np.asarray, _built(machine, basis))
     motion = states(machine)
     found = forms.closed_form(forms.one_lane(plant), *motion)[1]
     return (found.pose, found.modal), forms.by_lagrangian(machine, basis, *motion)
@@ -79,14 +83,13 @@ def end_angles(loop, state):
 
 def test_energy_lost_is_the_work_of_the_joints_and_steps_are_of_fourth_order():
     changes = SMOOTH | {"drive__kp": 0.0, "drive__kd": 0.0, "link__damping_ratio": 0.0}
-    structure, loop, start = at_home("rrr unequal", 2)  # only for its sizes
     study = parse_study({"link": {"modes": 2}, "control": {"feedback": "none"}}).change(**changes)
     structure, case = arrays(study)
     structure = structure._replace(n_steps=1)
     loop = prepared(structure, case).loop
     q = np.array([[1e-4, 1e-5], [5e-5, 0.0], [-1e-4, 2e-5]])
     home = np.array(HOME)
-    start = start._replace(pose=home, pose_rate=0 * home, q=q, q_rate=0 * q, z=0 * q, z_rate=0 * q)
+    start = PlantState(home, 0 * home, q, 0 * q, 0 * q, 0 * q)
     step = 1e-5
     voltages = np.zeros((3000, structure.n_links, structure.n_patches))
     after = run("etdrk4", structure, loop, step, 1, voltages, start)
@@ -187,7 +190,7 @@ def test_steps_are_short_enough_for_the_steepest_friction():
     structure, case = arrays(parse_study({"machine": {"joint_friction": 1e-3}}))
     loop = prepared(structure, case).loop
     still = lagrangian.RigidState(np.array(HOME), np.zeros(3), *np.zeros((2, 3, 8)))
-    chain = lagrangian.modal_chain(loop.plant, *still)
+    chain = _chain(loop.plant, *still)
 
     def on_modes(q_rate):
         rates = still.pose_rate, q_rate.reshape(3, 8)

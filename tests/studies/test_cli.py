@@ -17,6 +17,7 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ import studies
 from studies import cli, sources
 from studies.cli import app, console, main
 from studies.engine.modes import machine_modes
+from studies.single.summary import joint_notes
 from studies.study.files import READY
 from studies.study.margin import margin_in_db
 from studies.study.spec import load_study
@@ -159,6 +161,17 @@ def test_simulate_prints_its_answer_without_a_file(short_folder, short_run, caps
     for link in range(3):
         assert f"{1e6 * float(short_run.residual_rms[link].max()):.4g}" in out
     assert "written" not in out and sorted(short_folder.iterdir()) == before
+    assert ("Less than 2 um is left: joints" in out) == (short_run.residual_rms.max() < 2e-6)
+
+
+def test_where_joints_decide_is_said_of_little_vibration_without_friction():
+    def notes(residual, friction):
+        study = SimpleNamespace(machine=SimpleNamespace(joint_friction=friction))
+        metrics = SimpleNamespace(residual_rms=np.array([1e-7, residual]))
+        return joint_notes(SimpleNamespace(study=study, result=SimpleNamespace(metrics=metrics)))
+
+    assert [len(notes(*x)) for x in ((1.9e-6, 0.0), (2.1e-6, 0.0), (1.9e-6, 1e-4))] == [1, 0, 0]
+    assert notes(float("nan"), 0.0) == []
 
 
 def test_simulate_warns_of_patches_that_are_strained_too_far(
