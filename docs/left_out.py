@@ -1,7 +1,7 @@
 """What the equations leave out, and how large it is: `python docs/left_out.py [STUDY]`.
 
 Closed forms of beams, laminates and joints on the default machine and on a stubby one (links of
-length over thickness 20), or on the machine of a study file.
+length over thickness 20), or on the machine of a study file, of which link 1 stands for all.
 """
 
 import math
@@ -133,7 +133,10 @@ def main() -> None:
     machines = {"default": studies.Study()}
     machines["stubby"] = machines["default"].change(**STUBBY)
     if len(sys.argv) > 1:
-        machines = {sys.argv[1]: studies.load_study(sys.argv[1])}
+        try:
+            machines = {sys.argv[1]: studies.load_study(sys.argv[1])}
+        except studies.StudyError as error:
+            sys.exit(f"left_out: {error}")
     found = [rows(study) for study in machines.values()]
     print(" " * 50 + "".join(f"{name:>12.12}" for name in machines))
     for name in found[0]:

@@ -75,18 +75,9 @@ def axial_force(
     """
     still = jnp.zeros_like(plant.b)
     force = inverse_dynamics(plant, pose, pose_rate, pose_acc, wrench)
-    motion = accelerations(
-        plant,
-        close_chain(plant, pose, pose_rate),
-        pose_rate,
-        still,
-        still,
-        force,
-        still,
-        wrench,
-        is_coupled=False,
-    )
-    return motion.axial
+    chain = close_chain(plant, pose, pose_rate)
+    bent = still, still, force, still
+    return accelerations(plant, chain, pose_rate, *bent, wrench, is_coupled=False).axial
 
 
 def held_coordinates(plant: Plant, force: Array) -> Array:

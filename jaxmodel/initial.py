@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from jaxmodel import metrics
 from jaxmodel.case import MOTOR_ORDER, Structure
-from jaxmodel.controller import ControllerState, rest_controller
+from jaxmodel.controller import rest_controller
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import resting_drive
-from jaxmodel.hysteresis import Hysteresis
 from jaxmodel.lazy import jnp
-from jaxmodel.loop import Delayed, Loop, PlantState, State
+from jaxmodel.loop import Loop, PlantState, State
 from jaxmodel.parameters import Array
 
 
@@ -42,6 +41,11 @@ def initial_state(
     drained = jnp.where(highpass > 0, q, zero)
     controller = rest_controller(loop.controller)
     is_direct = is_sampled and loop.left_out is not None
+    settled = still if force is None else force
+
+    def none(count: int) -> Array:
+        return jnp.stack([jnp.zeros_like(controller.voltage)] * count)
+
     n_stations = loop.deflection_at.shape[1]
     sizes = metrics.Sizes(
         n_stations=n_stations,
@@ -65,9 +69,9 @@ def initial_state(
             direct_z=jnp.zeros_like(controller.voltage) if is_direct else None,
             direct_z_rate=jnp.zeros_like(controller.voltage) if is_direct else None,
             direct_s=jnp.zeros_like(controller.voltage) if is_direct and is_drained else None,
-            commands=None if loop.delayed is None else _on_their_way(loop.delayed, controller),
-            motor=_settled_motors(structure, still if force is None else force),
-            plays=None if loop.hysteresis is None else _no_plays(loop.hysteresis, controller),
+            commands=None if loop.delayed is None else none(loop.delayed.before.shape[0] - 2),
+            motor=jnp.stack([settled] * MOTOR_ORDER) if structure.has_drive_lag else None,
+            plays=None if loop.hysteresis is None else none(loop.hysteresis.play.shape[0]),
         ),
         controller=controller,
         totals=totals,
@@ -75,17 +79,3 @@ def initial_state(
         bad_time=jnp.zeros_like(code),
         drive=resting_drive(DRIVES[structure.drive], still),
     )
-
-
-def _on_their_way(delayed: Delayed, controller: ControllerState) -> Array:
-    """Commands before the start, all zero [V], (J - 2, 3, K)."""
-    return jnp.stack([jnp.zeros_like(controller.voltage)] * (delayed.before.shape[0] - 2))
-
-
-def _no_plays(hysteresis: Hysteresis, controller: ControllerState) -> Array:
-    """Actuators that nothing has driven before [V], (N, 3, K)."""
-    return jnp.stack([jnp.zeros_like(controller.voltage)] * hysteresis.play.shape[0])
-
-
-def _settled_motors(structure: Structure, force: Array) -> Array | None:
-    return jnp.stack([force] * MOTOR_ORDER) if structure.has_drive_lag else None

@@ -202,18 +202,8 @@ def plant_rates(
         force, piezo, wrench, torque = (
             pushed if structure.is_coupled else (force, pushed[1], wrench, None)
         )
-    rates = accelerations(
-        loop.plant,
-        chain,
-        state.pose_rate,
-        state.q,
-        state.q_rate,
-        force,
-        piezo,
-        wrench,
-        structure.is_coupled,
-        torque,
-    )
+    forces = force, piezo, wrench
+    rates = accelerations(loop.plant, chain, *state[1:4], *forces, structure.is_coupled, torque)
     return Rates(chain, rates, motor_rate)
 
 

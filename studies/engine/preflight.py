@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from jaxmodel import status
 from jaxmodel.axial import critical_force, lumping_error
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
+from jaxmodel.drive import LAG_POLE
 from jaxmodel.drives import DRIVES
 from jaxmodel.kinematics import path_status
 from jaxmodel.laws import is_modal, n_channels
@@ -173,9 +175,14 @@ def _checked(study: Study, is_run: bool) -> tuple[Structure, Case]:
     structure, case = build_structure(study), as_arrays(build_case(study))
     prepared = preflight(structure, case)
     substeps = _drive_substeps(study, float(prepared.drive_rate))
+    rate = float(prepared.coupled_rate) / study.electronics.sample_rate_hz / COUPLED_STEP_LIMIT
     if not study.run.substeps:
-        rate = float(prepared.coupled_rate) / study.electronics.sample_rate_hz
-        substeps = max(substeps, int(step_counts(rate / COUPLED_STEP_LIMIT)))
+        substeps = max(substeps, int(step_counts(rate)))
+    joints, most = study.machine, study.run.substeps or SUBSTEP_LIMIT
+    if joints.joint_friction > 0 and rate > most:
+        beside = f"machine.joint_friction_speed = {joints.joint_friction_speed:g} rad/s"
+        allowed = _resolved(most, beside, math.ceil(rate))
+        raise field_error("machine.joint_friction", joints.joint_friction, allowed, "N m")
     structure = structure._replace(substeps=substeps)
     for k, pose in enumerate(study.motion.waypoints):
         check_pose(study, f"motion.waypoints.{k}", pose, int(prepared.pose_status[k]))
@@ -379,21 +386,27 @@ def _drive_substeps(study: Study, rate: float) -> int:
             f"rate of {rate:.3g} 1/s",
             "1",
         )
+    shortest = LAG_POLE / (SUBSTEP_LIMIT * STIFFNESS_LIMIT * study.electronics.sample_rate_hz)
+    if 0 < drive.lag < shortest:
+        allowed = f"0, or {shortest:.2g} or more, which {SUBSTEP_LIMIT} plant steps resolve"
+        raise field_error("drive.lag", drive.lag, allowed, "s")
     slope = drive.coulomb_friction / drive.friction_speed
-    parts = {
-        "drive.kd": 0.0 if DRIVES[drive.kind].is_sampled else drive.kd,
-        "drive.viscous_friction": drive.viscous_friction,
-        "drive.coulomb_friction": slope,
-    }
-    name = max(parts, key=parts.__getitem__)
-    value = drive.coulomb_friction if name == "drive.coulomb_friction" else parts[name]
-    raise field_error(
-        name,
-        value,
-        f"small enough for {SUBSTEP_LIMIT} plant steps per sample with drive.kd, "
-        f"drive.viscous_friction and drive.coulomb_friction/drive.friction_speed = {slope:g} N s/m "
-        f"on machine.slider_mass; {needed} would be needed",
-        "N" if name == "drive.coulomb_friction" else "N s/m",
+    kd = 0.0 if DRIVES[drive.kind].is_sampled else drive.kd
+    _, name, value, unit = max(
+        (kd, "kd", drive.kd, "N s/m"),
+        (drive.viscous_friction, "viscous_friction", drive.viscous_friction, "N s/m"),
+        (slope, "coulomb_friction", drive.coulomb_friction, "N"),
+    )
+    beside = (
+        "drive.kd, drive.viscous_friction and drive.coulomb_friction/drive.friction_speed = "
+        f"{slope:g} N s/m on machine.slider_mass"
+    )
+    raise field_error(f"drive.{name}", value, _resolved(SUBSTEP_LIMIT, beside, needed), unit)
+
+
+def _resolved(steps: int, beside: str, needed: int) -> str:
+    return (
+        f"small enough for {steps} plant steps per sample with {beside}; {needed} would be needed"
     )
 
 

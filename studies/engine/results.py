@@ -370,10 +370,10 @@ def _worst(
 
 def counted_links(data: SweepData) -> np.ndarray:
     """Links that a metric of a sweep counts, (n,)."""
-    return links_of(data.spec, data.table)
+    return links_of(data.spec, None if data.spec.sweep.links else data.table)
 
 
-def links_of(spec: SweepSpec, table: CaseTable) -> np.ndarray:
+def links_of(spec: SweepSpec, table: CaseTable | None) -> np.ndarray:
     """Links that a metric of some cases counts, (n,).
 
     Those of `sweep.links`, else those that any case controls, all if none does: the same for all
@@ -381,6 +381,7 @@ def links_of(spec: SweepSpec, table: CaseTable) -> np.ndarray:
     """
     if named := spec.sweep.links:
         return np.isin(np.arange(spec.study.n_links) + 1, named)
+    assert table is not None  # a sweep that names no links has its cases
     is_counted = np.any(controlled(table), axis=0)
     return is_counted if is_counted.any() else np.ones_like(is_counted)
 

@@ -222,17 +222,7 @@ def closed_form(plant: Plant, motion: RigidState, loads: Loads) -> tuple[Chain, 
     if plant.joint_friction is not None:
         rates = motion.pose_rate, motion.q_rate
         force, modal, wrench, torque = rub(plant, chain, rates, force, modal, None)
-    found = accelerations(
-        plant,
-        chain,
-        motion.pose_rate,
-        motion.q,
-        motion.q_rate,
-        force,
-        modal,
-        wrench,
-        torque=torque,
-    )
+    found = accelerations(plant, chain, *motion[1:], force, modal, wrench, torque=torque)
     return chain, found
 
 

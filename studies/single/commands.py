@@ -167,7 +167,7 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
     """Print status, link metrics and stability; twin: the same run without control."""
     from studies.engine.poles import HEADER, difference, pole_rows
     from studies.show.listing import print_rows
-    from studies.single.summary import joint_notes, limits_text, link_rows
+    from studies.single.summary import limits_text, link_rows, machine_notes
     from studies.study.labels import describe, remedy
     from studies.study.margin import (
         MARGIN_MODES,
@@ -186,7 +186,7 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
     if advice := remedy(run.status):
         console.print(f"next step: {advice}", soft_wrap=True)
     print_rows(link_rows(run, twin), console)
-    for note in joint_notes(run):
+    for note in machine_notes(run):
         console.print(note, soft_wrap=True)
     settled = run.study.metrics.residual_delay == AUTO
     console.print(

@@ -23,9 +23,9 @@ from studies.show.sketch import CAPTION
 from studies.show.units import is_cut_off, number
 from studies.show.words import control_text, motion_text
 from studies.single.summary import (
-    joint_notes,
     limits_text,
     link_rows,
+    machine_notes,
     settling_text,
     watched,
 )
@@ -81,7 +81,7 @@ def report(
         metrics=result.metrics,
         loop=run.loop,
         planned=run.motion,
-        notes=[*notes, *joint_notes(run)],
+        notes=[*notes, *machine_notes(run)],
         name=name,
         motion=motion_text(study),
         control=control_text(study),

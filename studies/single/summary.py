@@ -65,12 +65,15 @@ def limits_text(run: Run) -> str:
     return f"CAUTION: {'; '.join(warnings)}." if warnings and run.status == status.OK else ""
 
 
-def joint_notes(run: Run) -> list[str]:
-    """That joints decide how little vibration is left, if they do."""
-    residual = np.max(run.result.metrics.residual_rms)
-    if not residual < STICKING or run.study.machine.joint_friction > 0:
-        return []
-    return [
-        "Less than 2 um is left: joints that rub decide there (machine.joint_friction, here 0; "
-        "small ball bearings have 0.05 to 0.5 mN m)."
-    ]
+def machine_notes(run: Run) -> list[str]:
+    """What a real machine would do beside: joints that decide how little is left, cracks."""
+    metrics, notes = run.result.metrics, []
+    if np.max(metrics.residual_rms) < STICKING and run.study.machine.joint_friction == 0:
+        notes.append(
+            "Less than 2 um is left: joints that rub decide there, since they hold a link that "
+            "hardly bends (machine.joint_friction, here 0; small ball bearings have 0.05 to 0.5 "
+            "mN m)."
+        )
+    if (strain := np.max(metrics.patch_strain_peak)) > (limit := run.study.patches.strain_limit):
+        notes.append(f"Ceramics strained up to {strain:.3g}, patches.strain_limit = {limit:g}.")
+    return notes

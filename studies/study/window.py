@@ -104,6 +104,8 @@ def never_settles(study: Study) -> StudyError:
     """What to say where the residual window would have to wait for ever."""
     drive, wait = study.drive, settling_time(study)
     name, value, unit = ("kd", drive.kd, "N s/m") if drive.kp > 0 else ("kp", drive.kp, "N/m")
+    if drive.lag > 0:
+        name, value, unit = "lag", drive.lag, "s"
     duration = f"takes {wait:.3g} s" if math.isfinite(wait) else "never does"
     return field_error(
         f"drive.{name}",

@@ -30,7 +30,7 @@ from jaxmodel.metrics import METRICS
 from studies.engine.preflight import check_run
 from studies.errors import StudyError, field_error, nearest, shown, shown_name
 from studies.space.free import FreeNumbers
-from studies.study.cases import build_structure
+from studies.study.cases import SWITCHES, build_structure
 from studies.study.entries import controlled_links, entry_sizes, parse_entries
 from studies.study.explain import explain
 from studies.study.files import read_toml
@@ -584,7 +584,8 @@ def _check_family(family: Family, move: dict[str, Any], study: Study) -> None:
     kept = {"law", "drive", "has_poles", "has_position_gain", "has_noise", "substeps"}
     for field, a, b in zip(structure._fields, structure, changed_structure, strict=True):
         if a != b and field not in kept:
+            switch = f"use of {' or '.join(SWITCHES[field])}" if field in SWITCHES else field
             raise StudyError(
-                f"{prefix}{field} = {shown(b)} where the study has {shown(a)}; allowed: what runs "
-                "by the same program"
+                f"{prefix}{switch} = {shown(b)} where the study has {shown(a)}; allowed: what runs "
+                "by the same program (a small value in place of none)"
             )

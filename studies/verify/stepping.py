@@ -18,6 +18,7 @@ from jaxmodel.kinematics import inverse_kinematics
 from jaxmodel.loop import Loop, PlantState, plant_step
 from jaxmodel.motion import end_of_path, sample_path
 from jaxmodel.prepare import oscillators, prepare
+from jaxmodel.status import FINISHED
 from studies.engine.executor import Executor
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.preflight import check_run
@@ -265,7 +266,7 @@ def _metrics(study: Study) -> list[Assumption]:
     inside = (record.time > begin - half) & (record.time < end - half)
     rms = np.sqrt(np.mean(record.chord_deflection_stations[inside] ** 2, axis=0))
     peak = np.abs(record.actuator_voltage).max(axis=(0, 2))
-    reason = "" if run.status == 0 else "the run does not finish"
+    reason = "" if run.status in FINISHED else "the run does not finish"
     return [
         Assumption(
             assumption="residual vibration as a metric",

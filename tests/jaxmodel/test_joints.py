@@ -19,6 +19,7 @@ from jaxmodel.prepare import STIFFNESS_LIMIT
 from jaxmodel.simulate import simulate
 from studies.engine.preflight import check_run
 from studies.engine.runs import run_study
+from studies.errors import StudyError
 from studies.reference import lagrangian
 from studies.verify import machine as verified
 from tests import forms
@@ -131,7 +132,7 @@ FAST = {
 
 def rung(torque):
     """Mode 1 from 26 to 76 ms after a fast move [um], rms and about its mean, (3,) each."""
-    study = FAST | {"run": FAST["run"] | {"substeps": 16 if torque else 1}}
+    study = FAST | {"run": FAST["run"] | {"substeps": 32 if torque else 1}}
     study = parse_study(study | {"machine": {"joint_friction": torque}})
     record = run_study(study, has_loop=False).result.record
     seen = 1e6 * np.asarray(record.modal_coordinate)[(record.time > 0.0559) & (record.time < 0.106)]
@@ -201,3 +202,8 @@ def test_steps_are_short_enough_for_the_steepest_friction():
     assert joint_decay(loop.plant) == pytest.approx(fastest, rel=1e-9)
     steps = check_run(parse_study(FAST | {"machine": {"joint_friction": 1e-3}}))[0].substeps
     assert 1 <= STIFFNESS_LIMIT * steps / (fastest * SAMPLE) < 2
+    for most, changes in ((200, {}), (3, {"run__substeps": 3})):
+        rough = parse_study(FAST).change(machine__joint_friction=0.5, **changes)
+        said = f"machine.joint_friction = 0.5; allowed: small enough for {most} plant steps"
+        with pytest.raises(StudyError, match=said):
+            check_run(rough)

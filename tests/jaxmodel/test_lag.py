@@ -10,6 +10,7 @@ from jaxmodel.linear import linearise, mass_and_stiffness, natural_modes
 from jaxmodel.mechanisms.prrr.paper import HOME
 from studies.engine.loop_gain import loop_gains
 from studies.engine.margins import judge_loops
+from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
 from studies.engine.runs import run_study
 from studies.engine.stability import loop_report
@@ -129,6 +130,10 @@ def test_the_window_waits_and_what_does_not_know_it_says_so():
         check_supported(study_of("pd", drive__lag=1e-3))
     with pytest.raises(StudyError, match=r"drive.lag = 1"):
         study_of("pd", drive__lag=1.0)
+    with pytest.raises(StudyError, match=r"drive.lag = 0.1; allowed: a drive that settles"):
+        check_run(study_of("pd", drive__lag=0.1, metrics__residual_delay="auto"))
+    with pytest.raises(StudyError, match=r"drive.lag = 1e-09; allowed: 0, or 8.2e-07 or more"):
+        check_run(study_of("pd", drive__lag=1e-9))
 
 
 def test_a_loop_without_lag_has_no_states_for_it():

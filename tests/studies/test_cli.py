@@ -28,7 +28,7 @@ import studies
 from studies import cli, sources
 from studies.cli import app, console, main
 from studies.engine.modes import machine_modes
-from studies.single.summary import joint_notes
+from studies.single.summary import machine_notes
 from studies.study.files import READY
 from studies.study.margin import margin_in_db
 from studies.study.spec import load_study
@@ -164,14 +164,20 @@ def test_simulate_prints_its_answer_without_a_file(short_folder, short_run, caps
     assert ("Less than 2 um is left: joints" in out) == (short_run.residual_rms.max() < 2e-6)
 
 
-def test_where_joints_decide_is_said_of_little_vibration_without_friction():
-    def notes(residual, friction):
-        study = SimpleNamespace(machine=SimpleNamespace(joint_friction=friction))
-        metrics = SimpleNamespace(residual_rms=np.array([1e-7, residual]))
-        return joint_notes(SimpleNamespace(study=study, result=SimpleNamespace(metrics=metrics)))
+def test_what_a_real_machine_would_do_beside_is_said():
+    def notes(residual, friction=0.0, strain=1e-4):
+        study = SimpleNamespace(
+            machine=SimpleNamespace(joint_friction=friction),
+            patches=SimpleNamespace(strain_limit=4e-4),
+        )
+        peaks = {"patch_strain_peak": np.array([0.0, strain])}
+        metrics = SimpleNamespace(residual_rms=np.array([1e-7, residual]), **peaks)
+        return machine_notes(SimpleNamespace(study=study, result=SimpleNamespace(metrics=metrics)))
 
-    assert [len(notes(*x)) for x in ((1.9e-6, 0.0), (2.1e-6, 0.0), (1.9e-6, 1e-4))] == [1, 0, 0]
-    assert notes(float("nan"), 0.0) == []
+    said = [notes(1.9e-6), notes(2.1e-6), notes(1.9e-6, 1e-4), notes(float("nan"))]
+    assert [len(x) for x in said] == [1, 0, 0, 0] and "joints that rub" in said[0][0]
+    strained = "Ceramics strained up to 0.00041, patches.strain_limit = 0.0004."
+    assert notes(1.0, strain=4.1e-4) == [strained]
 
 
 def test_simulate_warns_of_patches_that_are_strained_too_far(

@@ -346,6 +346,10 @@ def test_the_same_links_count_for_all_designs(tmp_path):
     }
     done = screened(tmp_path / "out", small_spec(sweep), shard_size=8)
     assert done.screen.spec.sweep.links == (1, 2)
+    write_screen_report(tmp_path / "out", done)
+    assert "largest of links 1 and 2 and all stations" in text_of(
+        (tmp_path / "out" / "report.html").read_text()
+    )
     run_sweep(small_spec(sweep), tmp_path / "sweep", is_quiet=True)
     data = read_sweep(tmp_path / "sweep")
     whole = metric_values(data, "residual_rms")
