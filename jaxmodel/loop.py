@@ -448,8 +448,7 @@ def advance(
     command = motor_force(structure, loop.drive, reference, chain.rho, chain.rho_rate)
     motors, _ = late_force(loop.drive, command, plant.motor)
     present = acting_now(loop.hysteresis, plant.voltage, plant.plays, voltage)
-    forces = command, motors
-    sample = _sample(loop, plant, inputs, voltage, present, clipped, forces, rates)
+    sample = _sample(loop, plant, inputs, voltage, present, clipped, (command, motors), rates)
     fixed = metrics.Fixed(loop.omega, loop.modal_omega, loop.rotation, loop.settling_band)
     totals = metrics.accumulate(state.totals, metrics.Instant(sample, inputs.window, fixed))
     record = Record(

@@ -154,7 +154,7 @@ def joint_angles(machine: Machine, basis: ModalBasis, pose: Any, q: Any) -> Any:
     return jnp.stack(
         [
             near - jnp.stack(jnp.asarray(cranks)) * rho,
-            far - (pose[2] if len(pose) == 3 else jnp.mean(far)),
+            far - (jnp.mean(far) if len(pose) == 2 else pose[2]),
         ]
     )
 

@@ -206,15 +206,16 @@ def _poles(slopes: np.ndarray, scale: float, lag: float, viscous: float) -> np.n
     feedback, own = slopes
     if not np.any(own) and lag == 0:
         return np.roots([1.0, scale * (feedback[1] + viscous), scale * feedback[0]])
-    state = np.zeros((6, 6))  # e, e', memory, and the states of a motor
-    state[0, 1], state[1, 1], state[2, :3] = 1.0, -scale * viscous, own
-    used = np.r_[0:3] if np.any(own) else np.r_[0:2]
+    n = len(own)
+    state = np.zeros((n + len(LAG),) * 2)  # e, e', memory, and the states of a motor
+    state[0, 1], state[1, 1], state[n - 1, :n] = 1.0, -scale * viscous, own
+    used = np.arange(n if np.any(own) else n - 1)
     if lag == 0:
-        state[1, :3] -= scale * feedback
+        state[1, :n] -= scale * feedback
     else:
-        used, late = np.r_[used, 3:6], np.array(LAG) / lag
-        state[1, 3], state[3:, 3:] = -scale, late[:, :3]
-        state[3:, :3] = late[:, 3:] * feedback
+        used, late = np.r_[used, n : len(state)], np.array(LAG) / lag
+        state[1, n], state[n:, n:] = -scale, late[:, :-1]
+        state[n:, :n] = late[:, -1:] * feedback
     return np.linalg.eigvals(state[np.ix_(used, used)])
 
 

@@ -237,7 +237,7 @@ def test_one_channel_at_its_limit_is_enough(factor, sign):
         for i in range(3):
             volts = place((i, 1), sign * factor * 80.0, (3, 2))
             force = place(i, sign * factor * loop.drive.force_limit[i])
-            some = _sample(loop, plant, inputs, volts, volts, 0.0, np.zeros(3), rates)
+            some = _sample(loop, plant, inputs, volts, volts, 0.0, (np.zeros(3),) * 2, rates)
             assert (some.is_saturated, some.is_motor_saturated) == (is_full, 0)
-            some = _sample(loop, plant, inputs, zero, zero, 0.0, force, rates)
+            some = _sample(loop, plant, inputs, zero, zero, 0.0, (force, 0 * force), rates)
             assert (some.is_saturated, some.is_motor_saturated) == (0, is_full)

@@ -47,6 +47,7 @@ IDLE = [
     ({}, "patches.gauge_noise", 0.1),
     ({"patches.sensor": "strain_gauge"}, "electronics.sensor_highpass_hz", 5.0),
     ({}, "drive.friction_speed", 0.5),
+    ({}, "machine.joint_friction_speed", 0.5),
 ]
 IDS = [f"{name} {' '.join(given)}" for given, name, _ in IDLE]
 
