@@ -11,7 +11,7 @@ import numpy as np
 
 import studies
 from studies.study.links import LinkSection
-from studies.study.window import _poles, rigid_machine
+from studies.study.window import drive_poles
 
 #: Links of 200 x 20 x 10 mm that carry 2 kg on stronger drives.
 STUBBY = {
@@ -98,14 +98,9 @@ def adhesive(study: studies.Study) -> dict[str, float]:
 
 def drives(study: studies.Study) -> dict[str, float]:
     """Damping of the slowest swing on rigid links, and with motors that follow late."""
-    inertia, rates = rigid_machine(study)
-    half = np.linalg.inv(np.linalg.cholesky(inertia))
-    gains = np.array([[study.drive.kp, study.drive.kd, 0.0], [0.0, 0.0, 0.0]])
-
-    lightness = np.linalg.eigvalsh(half @ rates.T @ rates @ half.T)[0]
     found = {}
     for lag in (0.0, 1e-3, 2e-3):
-        poles = _poles(gains, lightness, lag, study.drive.viscous_friction)
+        poles = drive_poles(study.change(drive__lag=lag))
         swing = poles[poles.imag > 1]
         slow = swing[np.argmin(np.abs(swing))]
         found[f"damping of the drives, lag {1e3 * lag:g} ms [1]"] = -slow.real / abs(slow)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from jaxmodel.case import Drive, Structure
+from jaxmodel.case import MOTOR_ORDER, Drive, Structure
 from jaxmodel.controller import soft_limit
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import DriveState, SliderError, drive_force
@@ -58,6 +58,16 @@ LAG = ((-9.0, 6.0, 0.0, 3.0), (-6.0, 0.0, 10.0, -4.0), (-1.0, 0.0, 0.0, 1.0))
 LAG_POLE = 4.1
 #: Of the idle states of motors without lag in a batch with others [s].
 _IDLE = 0.01
+
+
+def settled_motors(structure: Structure, force: Array) -> Array | None:
+    """States of motors that have followed their commands to a force [N], (3, n), as `late_force`.
+
+    Args:
+        structure: static choices.
+        force: [N], (n,).
+    """
+    return jnp.stack([force] * MOTOR_ORDER) if structure.has_drive_lag else None
 
 
 def late_force(drive: Drive, command: Array, motor: Array | None) -> tuple[Array, Array | None]:

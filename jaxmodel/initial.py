@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from jaxmodel import metrics
-from jaxmodel.case import MOTOR_ORDER, Structure
+from jaxmodel.case import Structure
 from jaxmodel.controller import rest_controller
+from jaxmodel.drive import settled_motors
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import resting_drive
 from jaxmodel.lazy import jnp
@@ -41,7 +42,6 @@ def initial_state(
     drained = jnp.where(highpass > 0, q, zero)
     controller = rest_controller(loop.controller)
     is_direct = is_sampled and loop.left_out is not None
-    settled = still if force is None else force
 
     def none(count: int) -> Array:
         return jnp.stack([jnp.zeros_like(controller.voltage)] * count)
@@ -70,7 +70,7 @@ def initial_state(
             direct_z_rate=jnp.zeros_like(controller.voltage) if is_direct else None,
             direct_s=jnp.zeros_like(controller.voltage) if is_direct and is_drained else None,
             commands=None if loop.delayed is None else none(loop.delayed.before.shape[0] - 2),
-            motor=jnp.stack([settled] * MOTOR_ORDER) if structure.has_drive_lag else None,
+            motor=settled_motors(structure, still if force is None else force),
             plays=None if loop.hysteresis is None else none(loop.hysteresis.play.shape[0]),
         ),
         controller=controller,

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxmodel.axial import axial_force, held_coordinates
 from jaxmodel.case import MOTOR_ORDER, Case, Structure
-from jaxmodel.drive import Reference, motor_force, slider_force
+from jaxmodel.drive import Reference, motor_force, settled_motors, slider_force
 from jaxmodel.drives import DRIVES
 from jaxmodel.dynamics import inverse_dynamics, kinetic_energy, modal_chain
 from jaxmodel.kinematics import close_chain
@@ -106,8 +106,7 @@ def linearise(
         force = axial_force(loop.plant, pose, rate, moment.acceleration, moment.wrench)
         held_q = held_coordinates(loop.plant, force)
         chain = modal_chain(loop.plant, pose, rate, held_q, zero)
-    motor = jnp.zeros((MOTOR_ORDER, *still.shape)) if structure.has_drive_lag else None
-    rest = flatten(PlantState(pose, rate, held_q, zero, motor=motor))
+    rest = flatten(PlantState(pose, rate, held_q, zero, motor=settled_motors(structure, still)))
     has_feedforward = (
         structure.has_drive_lag or DRIVES[structure.drive].has_feedforward or structure.has_wrench
     )

@@ -288,6 +288,10 @@ def plant_step(
     # traced once, called four times
     rates = jax.jit(partial(_split_rates, structure, loop))
 
+    def course(at: PlantState, now: Rates) -> tuple[Array, tuple[Any, ...]]:
+        """Push on the modes, and slopes of all else."""
+        return now.acceleration.coupling, (at.pose_rate, now.acceleration.pose, now.motor)
+
     def stage(
         origin: PlantState, x: tuple[Any, ...], slope: tuple[Any, ...], length: Array, push: Array
     ) -> PlantState:
@@ -303,20 +307,16 @@ def plant_step(
 
     x = (state.pose, state.pose_rate, state.motor)
     first = rates(state, start, volts[0])
-    n1 = first.acceleration.coupling
-    slope1 = (state.pose_rate, first.acceleration.pose, first.motor)
+    n1, slope1 = course(state, first)
     a = stage(state, x, slope1, h / 2, n1)
     second = rates(a, middle, volts[1])
-    n2 = second.acceleration.coupling
-    slope2 = (a.pose_rate, second.acceleration.pose, second.motor)
+    n2, slope2 = course(a, second)
     b = stage(state, x, slope2, h / 2, n2)
     third = rates(b, middle, volts[1])
-    n3 = third.acceleration.coupling
-    slope3 = (b.pose_rate, third.acceleration.pose, third.motor)
+    n3, slope3 = course(b, third)
     c = stage(a, x, slope3, h, 2 * n3 - n1)
     fourth = rates(c, end, volts[2])
-    n4 = fourth.acceleration.coupling
-    slope4 = (c.pose_rate, fourth.acceleration.pose, fourth.motor)
+    n4, slope4 = course(c, fourth)
 
     def combine(k: int) -> Array:
         return slope1[k] + 2 * (slope2[k] + slope3[k]) + slope4[k]

@@ -215,13 +215,12 @@ def _explicit_rate(structure: Structure, case: Case, plant: Plant, omega: Array)
     Args:
         omega: of `oscillators`.
     """
+    friction = joint_decay(plant)
     if not structure.has_stretch:
-        return joint_decay(plant)
+        return friction
     pose = jnp.asarray(case.path.waypoints[-1])
     is_ok = chain_status(plant, close_chain(plant, pose, jnp.zeros_like(pose))) == status.OK
-    return jnp.maximum(
-        joint_decay(plant), jnp.where(is_ok, STRETCHING * jnp.max(omega[:, -1]), 0.0)
-    )
+    return jnp.maximum(friction, jnp.where(is_ok, STRETCHING * jnp.max(omega[:, -1]), 0.0))
 
 
 def _exponential(

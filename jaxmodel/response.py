@@ -14,8 +14,8 @@ import numpy as np
 
 from jaxmodel.bases import station_places
 from jaxmodel.beam import build_basis, held_frequency, left_out_of_loads
-from jaxmodel.case import MOTOR_ORDER, Case, Structure
-from jaxmodel.drive import Reference
+from jaxmodel.case import Case, Structure
+from jaxmodel.drive import Reference, settled_motors
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import drive_gains
 from jaxmodel.dynamics import modal_chain
@@ -185,8 +185,7 @@ def _forces(structure: Structure, loop: Loop, case: Case, pose: Array) -> tuple[
         wrench, force = load[:n], jnp.reshape(load[n:], zero.shape)
         if structure.has_wrench:
             wrench = wrench + case.load.wrench
-        motor = jnp.zeros((MOTOR_ORDER, links)) if structure.has_drive_lag else None
-        at = PlantState(pose, still, zero, zero, motor=motor)
+        at = PlantState(pose, still, zero, zero, motor=settled_motors(structure, still))
         rates = plant_rates(open_loop, pushed, at, reference._replace(wrench=wrench), force)
         moves = rates.acceleration
         return flatten(PlantState(still, moves.pose, zero, moves.modal, motor=rates.motor))

@@ -153,7 +153,7 @@ def joint_angles(machine: Machine, basis: ModalBasis, pose: Any, q: Any) -> Any:
     cranks = [0.0 if isinstance(x, Rail) else x.elbow / x.length for x in carriers]
     return jnp.stack(
         [
-            near - jnp.stack(jnp.asarray(cranks)) * rho,
+            near - jnp.asarray(cranks) * rho,
             far - (jnp.mean(far) if len(pose) == 2 else pose[2]),
         ]
     )

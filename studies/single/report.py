@@ -22,13 +22,7 @@ from studies.show.pages import page
 from studies.show.sketch import CAPTION
 from studies.show.units import is_cut_off, number
 from studies.show.words import control_text, motion_text
-from studies.single.summary import (
-    limits_text,
-    link_rows,
-    machine_notes,
-    settling_text,
-    watched,
-)
+from studies.single.summary import limits_text, link_rows, machine_notes, settling_text, watched
 from studies.study.margin import ENOUGH, MARGIN_MODES, caution, hysteresis_text, stretch_text
 
 #: Figures, by the end of the file name.

@@ -151,14 +151,21 @@ def check_varied(data: Mapping[str, Any], study: Study, names: Iterable[str]) ->
 def settling_time(study: Study) -> float:
     """Time in which the drive's slowest motion decays to SETTLED [s].
 
-    The poles are those of the machine with rigid links at the last way-point, its drives held by
+    Returns:
+        inf if a pole has no decay.
+    """
+    decay = float(np.min(-np.real(drive_poles(study))))
+    return math.log(1 / SETTLED) / decay if decay > 0 else math.inf
+
+
+def drive_poles(study: Study) -> np.ndarray:
+    """Poles of the drives [1/s], (n,).
+
+    They are those of the machine with rigid links at the last way-point, its drives held by
     k_p and k_d (and viscous friction): with the inertia M of the pose and the sliders' rates J X',
     each lambda of J^T J v = lambda M v is a mode s^2 + lambda k_d s + lambda k_p = 0, and of higher
     order where the drive remembers or its motor follows late. Where the drives differ from slider
     to slider, each is taken for all.
-
-    Returns:
-        inf if a pole has no decay.
     """
     inertia, rates = rigid_machine(study)
     # both are scaled by M^(-1/2), which keeps the problem symmetric
@@ -166,9 +173,7 @@ def settling_time(study: Study) -> float:
     scale = np.linalg.eigvalsh(half @ rates.T @ rates @ half.T)
     drives = np.unique(_drive_slopes(study), axis=0)
     late = study.drive.lag, study.drive.viscous_friction
-    poles = np.concatenate([_poles(drive, s, *late) for drive in drives for s in scale])
-    decay = float(np.min(-np.real(poles)))
-    return math.log(1 / SETTLED) / decay if decay > 0 else math.inf
+    return np.concatenate([_poles(drive, s, *late) for drive in drives for s in scale])
 
 
 #: Deviation at which a drive is linearised: a power of two, so that proportional ones are exact.

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodel.case import MOTOR_ORDER, Case, Structure
-from jaxmodel.drive import Reference
+from jaxmodel.case import Case, Structure
+from jaxmodel.drive import Reference, settled_motors
 from jaxmodel.drives import DRIVES
 from jaxmodel.dynamics import kinetic_energy, modal_chain, potential_energy
 from jaxmodel.integrator import exponential_step
@@ -117,7 +117,7 @@ def _at_rest(structure: Structure, case: Case, q: np.ndarray) -> PlantState:
     bent[:, 0] = q
     pose = np.asarray(case.path.waypoints[0], float)
     still = np.zeros_like(pose)
-    motor = np.zeros((MOTOR_ORDER, structure.n_links)) if structure.has_drive_lag else None
+    motor = settled_motors(structure, still)
     return PlantState(
         pose=pose, pose_rate=still, q=bent, q_rate=zero, z=zero, z_rate=zero, motor=motor
     )
