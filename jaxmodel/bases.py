@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 from jaxmodel.beam import ModalBasis, build_basis, held_frequency, mask_modes
 from jaxmodel.case import Case, Structure
-from jaxmodel.lazy import compiled, jax, jnp
-from jaxmodel.parameters import Array, Beam, Patches
+from jaxmodel.lazy import compiled, jnp
+from jaxmodel.parameters import Array
 
 
 class Bases(NamedTuple):
@@ -32,15 +32,15 @@ def find_bases(structure: Structure, case: Case) -> Bases:
         case: the numbers.
     """
     beam, patches, n = case.machine.beam, case.machine.patches, structure.n_controlled
-    belief = beam._replace(stiffness_factor=1.0)
+    belief, factor = beam._replace(stiffness_factor=1.0), beam.stiffness_factor
     size = max(structure.n_modes, n)
     load = jnp.broadcast_to(case.initial.load_station, (case.machine.n_links, 1))
     stations = jnp.concatenate([station_places(case), load], axis=1)
     both = structure.basis, structure.controller_basis
+    plant = build_basis(both[0], beam, patches, size, stations)
     if both[0] == both[1]:
-        plant, model = _side_by_side(both[0], beam, belief, patches, size, stations)
+        model = _with_stiffness(plant, jnp.broadcast_to(1 / factor, (case.machine.n_links,)))
     else:
-        plant = build_basis(both[0], beam, patches, size, stations)
         model = build_basis(both[1], belief, patches, size, stations)
     own = held_frequency(both[1], belief, model)[:, :n]
     written = case.control.omega
@@ -69,22 +69,12 @@ def _without_load(basis: ModalBasis) -> ModalBasis:
     )
 
 
-def _side_by_side(
-    kind: str, one: Beam, other: Beam, patches: Patches, size: int, stations: Array
-) -> tuple[ModalBasis, ModalBasis]:
-    """Compute two bases of one kind in one call.
-
-    Two eigenvalue problems in one program occasionally hang on CPUs (jax 0.10): XLA loses the
-    second.
-    """
-    pairs, count = zip(one, other, strict=True), len(stations)
-    beam = Beam(*(jnp.concatenate([jnp.broadcast_to(x, (count,)) for x in pair]) for pair in pairs))
-    twice = (jnp.asarray(x) for x in patches)
-    both = Patches(*(jnp.concatenate([x, x]) if x.ndim else x for x in twice))
-    joined = build_basis(kind, beam, both, size, jnp.tile(stations, (2, 1)))
-    return (
-        jax.tree.map(lambda x: x[:count], joined),
-        jax.tree.map(lambda x: x[count:], joined),
+def _with_stiffness(basis: ModalBasis, factor: Array) -> ModalBasis:
+    """The same links with this factor on their stiffness, which changes no shape."""
+    return basis._replace(
+        stiffness=basis.stiffness * factor[:, None],
+        static_slope=basis.static_slope / factor[:, None, None],
+        static_deflection=basis.static_deflection / factor[:, None, None],
     )
 
 

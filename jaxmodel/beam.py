@@ -297,7 +297,7 @@ def _pinned_free(beam: Beam, patches: Patches, n_modes: int, stations: Array) ->
 
 
 class _Shapes(NamedTuple):
-    """Ritz functions at some points, as functions of xi = x/L, (points, functions) each."""
+    """Ritz functions at some points, as functions of xi = x/L, (functions, points) each."""
 
     value: Array
     slope: Array
@@ -305,14 +305,24 @@ class _Shapes(NamedTuple):
 
 def _smooth_shapes(xi: Array, n_sines: int) -> tuple[_Shapes, Array]:
     """Sines, and two cubics, since sines cannot carry an end moment; and their curvatures."""
-    xi = jnp.asarray(xi)[:, None]
-    k = jnp.arange(1, n_sines + 1) * np.pi
-    sine, cosine = jnp.sin(k * xi), jnp.cos(k * xi)
-    value = [sine / k**2, xi * (1 - xi) ** 2, xi**2 * (1 - xi)]
-    slope = [cosine / k, 1 - 4 * xi + 3 * xi**2, 2 * xi - 3 * xi**2]
-    curvature = [-sine, 6 * xi - 4, 2 - 6 * xi]
-    shapes = _Shapes(jnp.concatenate(value, axis=1), jnp.concatenate(slope, axis=1))
-    return shapes, jnp.concatenate(curvature, axis=1)
+    xi = jnp.asarray(xi)
+    k = np.arange(1, n_sines + 1)[:, None] * np.pi
+    sine, cosine = _harmonics(xi, n_sines)
+    value = [sine / k**2, jnp.stack([xi * (1 - xi) ** 2, xi**2 * (1 - xi)])]
+    slope = [cosine / k, jnp.stack([1 - 4 * xi + 3 * xi**2, 2 * xi - 3 * xi**2])]
+    curvature = [-sine, jnp.stack([6 * xi - 4, 2 - 6 * xi])]
+    return _Shapes(jnp.concatenate(value), jnp.concatenate(slope)), jnp.concatenate(curvature)
+
+
+def _harmonics(xi: Array, count: int) -> tuple[Array, Array]:
+    """sin and cos of j pi xi, j = 1.., (count, points) each; by rotation, which is cheaper."""
+    first = jnp.sin(np.pi * xi), jnp.cos(np.pi * xi)
+    found = [first]
+    for _ in range(count - 1):
+        sine, cosine = found[-1]
+        found.append((sine * first[1] + cosine * first[0], cosine * first[1] - sine * first[0]))
+    sine, cosine = (jnp.stack(part) for part in zip(*found, strict=True))
+    return sine, cosine
 
 
 class _Bends(NamedTuple):
@@ -342,7 +352,41 @@ def _bent_shapes(xi: Array, bends: _Bends) -> _Shapes:
     end = ((1 - p) ** 2 - (1 - q) ** 2) / 2
     slope = jnp.maximum(x - p, 0.0) - jnp.maximum(x - q, 0.0) - end
     value = bent_at(bends.pieces, jnp.ones(()), xi)
-    return _Shapes(value @ bends.curvature.T, slope @ bends.curvature.T)
+    return _Shapes(bends.curvature @ value.T, bends.curvature @ slope.T)
+
+
+def _nodes(pieces: Pieces, length: Array, count: int) -> tuple[Array, Array]:
+    """Gauss's nodes piece by piece as shares of the link's length [1], and weights [m], (n, N)."""
+    node, weight = np.polynomial.legendre.leggauss(count)
+    width = (pieces.right - pieces.left)[:, None]
+    return pieces.left[:, None] + width * (node + 1) / 2, length * width * weight / 2
+
+
+def _sine_products(pieces: Pieces, density: Array, n_sines: int) -> Array:
+    """int f sin(j pi xi) sin(k pi xi) dxi, f constant on each piece, (n_sines, n_sines)."""
+    wave = np.arange(1, 2 * n_sines + 1)[:, None] * np.pi
+
+    def risen(xi: Array) -> Array:
+        """int cos(m pi xi) dxi from 0, m = 0.."""
+        return jnp.concatenate([xi[None], jnp.sin(wave * xi) / wave])
+
+    total = (risen(pieces.right) - risen(pieces.left)) @ density
+    order = np.arange(1, n_sines + 1)
+    apart, both = abs(order[:, None] - order), order[:, None] + order
+    return (total[apart] - total[both]) / 2
+
+
+def _products(functions: Array, weight: Array, sines: Array) -> Array:
+    """Integrals of products of two functions, (n, n).
+
+    Args:
+        functions: at nodes, sines first, (n, nodes).
+        weight: of the nodes, (nodes,).
+        sines: those of two sines, known in closed form.
+    """
+    count = len(sines)
+    rest = (functions * weight) @ functions[count:].T
+    return jnp.concatenate([jnp.concatenate([sines, rest[:count].T]), rest], axis=1)
 
 
 #: Added to the diagonal of the Ritz functions' stiffness, so that coinciding patches stay finite.
@@ -355,28 +399,24 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
     pieces = link_pieces(beam, patches)
     bends = _bends(pieces, length)
     line_mass = section_mass(beam, patches, pieces, has_patches=True)
+    stiffness = section_stiffness(beam, patches, pieces, has_patches=True)
 
     def shapes(xi: Array) -> _Shapes:
         smooth, bent = _smooth_shapes(xi, n_sines)[0], _bent_shapes(xi, bends)
-        return _Shapes(*(jnp.concatenate(pair, axis=1) for pair in zip(smooth, bent, strict=True)))
+        return _Shapes(*(jnp.concatenate(pair) for pair in zip(smooth, bent, strict=True)))
 
-    # Gauss-Legendre piece by piece: products of two sines have up to 2 n_sines half-waves, for
-    # which these points are exact to rounding
-    node, weight = _gauss(2 * n_sines + 16)
-    width = (bends.pieces.right - bends.pieces.left)[:, None]
-    xi = (bends.pieces.left[:, None] + width * node).ravel()
-    weight = length * (width * weight).ravel()
-    mass_w = weight * jnp.repeat(line_mass, node.size)
-    stiffness = section_stiffness(beam, patches, pieces, has_patches=True)
-    stiffness_w = weight * jnp.repeat(stiffness, node.size)
-
-    value, steepness = shapes(xi)
-    constant = jnp.repeat(bends.curvature, node.size, axis=1).T
-    curvature = jnp.concatenate([_smooth_shapes(xi, n_sines)[1], constant], axis=1)
+    # exact to rounding for a sine of n_sines half-waves times a cubic
+    xi, weight = _nodes(bends.pieces, length, n_sines + 16)
+    mass_w, stiffness_w = ((weight * y[:, None]).ravel() for y in (line_mass, stiffness))
+    value, smooth = shapes(xi.ravel()).value, _smooth_shapes(xi.ravel(), n_sines)[1]
+    curvature = jnp.concatenate([smooth, jnp.repeat(bends.curvature, xi.shape[1], axis=1)])
     ends = shapes(jnp.array([0.0, 1.0])).slope / length
     joint = jnp.stack([beam.joint_inertia_b, beam.joint_inertia_c])
-    mass_matrix = (value.T * mass_w) @ value + (ends.T * joint) @ ends
-    stiffness_matrix = (curvature.T * stiffness_w) @ curvature / length**4
+    square = (np.arange(1, n_sines + 1) * np.pi) ** 2
+    sines = length * _sine_products(bends.pieces, line_mass, n_sines) / square[:, None] / square
+    mass_matrix = _products(value, mass_w, sines) + (ends * joint) @ ends.T
+    sines = length * _sine_products(bends.pieces, stiffness, n_sines)
+    stiffness_matrix = _products(curvature, stiffness_w, sines) / length**4
 
     # functions of unit energy; one that is absent gets a unit of its own, no mass and so no mode
     energy = jnp.diagonal(stiffness_matrix)
@@ -392,15 +432,17 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
     softness, vector = softness[: -n_modes - 1 : -1], vector[:, : -n_modes - 1 : -1]
     coefficient = jax.scipy.linalg.solve_triangular(lower.T, vector, lower=False)
     coefficient = scale[:, None] * coefficient
-    coefficient = coefficient * jnp.where(ends[0] @ coefficient < 0, -1.0, 1.0)
-    total_mass = jnp.sum(mass_w)
+    coefficient = coefficient * jnp.where(ends[:, 0] @ coefficient < 0, -1.0, 1.0)
+    x, total_mass = xi.ravel() * length, jnp.sum(mass_w)
     coefficient = coefficient * jnp.sqrt(total_mass / 2 / softness)
 
     def slope(x: Array) -> Array:
-        return (shapes(x / length).slope @ coefficient).T / length
+        return coefficient.T @ shapes(x / length).slope / length
 
-    steepness = steepness @ coefficient / length
-    shortening = (steepness.T * weight) @ steepness
+    # products of two slopes have twice as many half-waves
+    xi, weight = (y.ravel() for y in _nodes(bends.pieces, length, 2 * n_sines + 16))
+    steepness = slope(xi * length)
+    shortening = (steepness * weight) @ steepness.T
     # mass and first moment of what lies beyond a point, piece by piece
     left, right = pieces.left[:, None], pieces.right[:, None]
     rest = jnp.clip(xi * length, left, right)
@@ -410,37 +452,30 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
         jnp.sum(line * (right**2 - rest**2) / 2, axis=0),
     )
     slopes, bent = static_bending(beam, patches, stations, has_patches=True)
-    x = xi * length
     return ModalBasis(
         mass=jnp.full((n_modes,), 0.5) * total_mass,
         stiffness=total_mass / 2 / softness,
         tip=None,
         shortening=jnp.diagonal(shortening),
         mixed_shortening=shortening * (1 - jnp.eye(n_modes)),
-        inward=(steepness.T * (weight * beyond[0])) @ steepness,
-        centrifugal=(steepness.T * (weight * beyond[1])) @ steepness,
-        b=mass_w @ value @ coefficient,
-        c=(mass_w * x) @ value @ coefficient + joint @ ends @ coefficient,
+        inward=(steepness * (weight * beyond[0])) @ steepness.T,
+        centrifugal=(steepness * (weight * beyond[1])) @ steepness.T,
+        b=value @ mass_w @ coefficient,
+        c=value @ (mass_w * x) @ coefficient + joint @ ends.T @ coefficient,
         link_mass=total_mass,
         first_moment=mass_w @ x,
         inertia=mass_w @ x**2 + jnp.sum(joint),
-        deflection_at=shapes(stations / length).value @ coefficient,
+        deflection_at=shapes(stations / length).value.T @ coefficient,
         sensor_slope=_slope_difference(slope, patches, patches.sensor_length),
         actuator_slope=_slope_difference(slope, patches, patches.actuator_length)
         + opposite_gain(beam, patches)
         * _slope_difference(
             slope, patches, jnp.minimum(patches.sensor_length, patches.actuator_length)
         ),
-        end_slope=(ends @ coefficient).T,
+        end_slope=coefficient.T @ ends,
         static_slope=slopes,
         static_deflection=bent,
     )
-
-
-def _gauss(n_points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights of Gauss-Legendre quadrature on [0, 1]."""
-    node, weight = np.polynomial.legendre.leggauss(n_points)
-    return (node + 1) / 2, weight / 2
 
 
 BASES = Table(

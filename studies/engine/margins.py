@@ -246,7 +246,7 @@ def _judge_block(
         return _judged(response, modes, np.maximum(strength / STRONG, 1.0), sweep, ratio)
 
 
-@kept_jit(static_argnums=0, is_quick=True)
+@kept_jit(static_argnums=0)
 def _respond(structure: Structure, cases: Case) -> tuple[LoopResponse, AssembledModes, Any]:
     """The loops, their modes and their strength, lanes last."""
 
