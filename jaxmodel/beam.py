@@ -303,15 +303,13 @@ class _Shapes(NamedTuple):
     slope: Array
 
 
-def _smooth_shapes(xi: Array, n_sines: int) -> tuple[_Shapes, Array]:
-    """Sines, and two cubics, since sines cannot carry an end moment; and their curvatures."""
-    xi = jnp.asarray(xi)
+def _smooth_shapes(xi: Array, n_sines: int) -> _Shapes:
+    """Sines, and two cubics, since sines cannot carry an end moment."""
     k = np.arange(1, n_sines + 1)[:, None] * np.pi
     sine, cosine = _harmonics(xi, n_sines)
     value = [sine / k**2, jnp.stack([xi * (1 - xi) ** 2, xi**2 * (1 - xi)])]
     slope = [cosine / k, jnp.stack([1 - 4 * xi + 3 * xi**2, 2 * xi - 3 * xi**2])]
-    curvature = [-sine, jnp.stack([6 * xi - 4, 2 - 6 * xi])]
-    return _Shapes(jnp.concatenate(value), jnp.concatenate(slope)), jnp.concatenate(curvature)
+    return _Shapes(jnp.concatenate(value), jnp.concatenate(slope))
 
 
 def _harmonics(xi: Array, count: int) -> tuple[Array, Array]:
@@ -355,11 +353,44 @@ def _bent_shapes(xi: Array, bends: _Bends) -> _Shapes:
     return _Shapes(bends.curvature @ value.T, bends.curvature @ slope.T)
 
 
-def _nodes(pieces: Pieces, length: Array, count: int) -> tuple[Array, Array]:
-    """Gauss's nodes piece by piece as shares of the link's length [1], and weights [m], (n, N)."""
+def _polynomials(bends: _Bends) -> Array:
+    """Coefficients of 1, xi, .. xi^3 of the cubics and bends on each piece, (2 + 2 K, n, 4)."""
+    p, q = bends.pieces.left, bends.pieces.right
+    end, n, zero = ((1 - p) ** 2 - (1 - q) ** 2) / 2, len(p), jnp.zeros_like(p)
+    # of a piece that is bent (first axis): on pieces before it, on itself, and on those after it
+    after, before = np.triu(np.ones((n, n)), 1), np.tril(np.ones((n, n)), -1)
+    parts = (
+        (before, (zero, -end, zero, zero)),
+        (np.eye(n), (p**2 / 2, -p - end, zero + 0.5, zero)),
+        (after, ((p**2 - q**2) / 2, q - p - end, zero, zero)),
+    )
+    unit = sum(where[:, :, None] * jnp.stack(x, axis=1)[:, None] for where, x in parts)
+    cubics = np.array([[0.0, 1.0, -2.0, 1.0], [0.0, 0.0, 1.0, -1.0]])
+    smooth = jnp.broadcast_to(cubics[:, None], (2, n, 4))
+    return jnp.concatenate([smooth, jnp.einsum("mn,npd->mpd", bends.curvature, unit)])
+
+
+def _nodes(pieces: Pieces, count: int) -> tuple[Array, Array]:
+    """Gauss's nodes of each piece and their weights as shares of the link's length, (n, N)."""
     node, weight = np.polynomial.legendre.leggauss(count)
     width = (pieces.right - pieces.left)[:, None]
-    return pieces.left[:, None] + width * (node + 1) / 2, length * width * weight / 2
+    return pieces.left[:, None] + width * (node + 1) / 2, width * weight / 2
+
+
+def _sine_moments(pieces: Pieces, n_sines: int) -> Array:
+    """int xi^d sin(j pi xi) dxi over each piece, d = 0.. 3, (n_sines, n, 4)."""
+    wave = np.arange(1, n_sines + 1)[:, None] * np.pi
+
+    def risen(xi: Array) -> Array:
+        sine, cosine = jnp.sin(wave * xi), jnp.cos(wave * xi)
+        of_sine, of_cosine = [-cosine / wave], [sine / wave]
+        for d in (1, 2, 3):  # by parts
+            last = of_sine[-1], of_cosine[-1]
+            of_sine.append((d * last[1] - xi**d * cosine) / wave)
+            of_cosine.append((xi**d * sine - d * last[0]) / wave)
+        return jnp.stack(of_sine, axis=-1)
+
+    return risen(pieces.right) - risen(pieces.left)
 
 
 def _sine_products(pieces: Pieces, density: Array, n_sines: int) -> Array:
@@ -376,17 +407,33 @@ def _sine_products(pieces: Pieces, density: Array, n_sines: int) -> Array:
     return (total[apart] - total[both]) / 2
 
 
-def _products(functions: Array, weight: Array, sines: Array) -> Array:
-    """Integrals of products of two functions, (n, n).
+class _Integrals(NamedTuple):
+    """Exact integrals over a link, piece by piece."""
 
-    Args:
-        functions: at nodes, sines first, (n, nodes).
-        weight: of the nodes, (nodes,).
-        sines: those of two sines, known in closed form.
-    """
-    count = len(sines)
-    rest = (functions * weight) @ functions[count:].T
-    return jnp.concatenate([jnp.concatenate([sines, rest[:count].T]), rest], axis=1)
+    pieces: Pieces  # their ends as shares of its length [1]
+    moment: Array  # `_sine_moments`
+    xi: Array  # nodes exact for products of two cubics [1], (n, 4)
+    weight: Array  # [1], (n, 4)
+
+    def single(self, density: Array, power: int, sines: np.ndarray, rest: Array) -> Array:
+        """int f xi^power y dxi of sines of these sizes, then polynomials (m, n, D), (n_s + m,)."""
+        value = self._at_nodes(rest) * self.xi**power * self.weight
+        smooth = sines * (self.moment[..., power] @ density)
+        return jnp.concatenate([smooth, jnp.sum(value, axis=2) @ density])
+
+    def double(self, density: Array, sines: np.ndarray, rest: Array) -> Array:
+        """int f y z dxi likewise, of every two functions."""
+        moment = self.moment[..., : rest.shape[2]] * sines[:, None, None]
+        mixed = jnp.einsum("kpd,mpd,p->km", moment, rest, density)
+        smooth = sines[:, None] * sines * _sine_products(self.pieces, density, len(sines))
+        value = self._at_nodes(rest)
+        own = jnp.einsum("mpg,npg->mn", value * (self.weight * density[:, None]), value)
+        top, bottom = jnp.concatenate([smooth, mixed], 1), jnp.concatenate([mixed.T, own], 1)
+        return jnp.concatenate([top, bottom])
+
+    def _at_nodes(self, rest: Array) -> Array:
+        power = jnp.stack([self.xi**d for d in range(rest.shape[2])], axis=-1)
+        return jnp.einsum("mpd,pgd->mpg", rest, power)
 
 
 #: Added to the diagonal of the Ritz functions' stiffness, so that coinciding patches stay finite.
@@ -402,21 +449,18 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
     stiffness = section_stiffness(beam, patches, pieces, has_patches=True)
 
     def shapes(xi: Array) -> _Shapes:
-        smooth, bent = _smooth_shapes(xi, n_sines)[0], _bent_shapes(xi, bends)
+        smooth, bent = _smooth_shapes(xi, n_sines), _bent_shapes(xi, bends)
         return _Shapes(*(jnp.concatenate(pair) for pair in zip(smooth, bent, strict=True)))
 
-    # exact to rounding for a sine of n_sines half-waves times a cubic
-    xi, weight = _nodes(bends.pieces, length, n_sines + 16)
-    mass_w, stiffness_w = ((weight * y[:, None]).ravel() for y in (line_mass, stiffness))
-    value, smooth = shapes(xi.ravel()).value, _smooth_shapes(xi.ravel(), n_sines)[1]
-    curvature = jnp.concatenate([smooth, jnp.repeat(bends.curvature, xi.shape[1], axis=1)])
+    integrals = _Integrals(
+        bends.pieces, _sine_moments(bends.pieces, n_sines), *_nodes(bends.pieces, 4)
+    )
     ends = shapes(jnp.array([0.0, 1.0])).slope / length
     joint = jnp.stack([beam.joint_inertia_b, beam.joint_inertia_c])
-    square = (np.arange(1, n_sines + 1) * np.pi) ** 2
-    sines = length * _sine_products(bends.pieces, line_mass, n_sines) / square[:, None] / square
-    mass_matrix = _products(value, mass_w, sines) + (ends * joint) @ ends.T
-    sines = length * _sine_products(bends.pieces, stiffness, n_sines)
-    stiffness_matrix = _products(curvature, stiffness_w, sines) / length**4
+    small, rest = 1 / (np.arange(1, n_sines + 1) * np.pi) ** 2, _polynomials(bends)
+    mass_matrix = length * integrals.double(line_mass, small, rest) + (ends * joint) @ ends.T
+    bent = jnp.stack([2 * rest[..., 2], 6 * rest[..., 3]], axis=2)
+    stiffness_matrix = integrals.double(stiffness, -np.ones(n_sines), bent) / length**3
 
     # functions of unit energy; one that is absent gets a unit of its own, no mass and so no mode
     energy = jnp.diagonal(stiffness_matrix)
@@ -433,23 +477,25 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
     coefficient = jax.scipy.linalg.solve_triangular(lower.T, vector, lower=False)
     coefficient = scale[:, None] * coefficient
     coefficient = coefficient * jnp.where(ends[:, 0] @ coefficient < 0, -1.0, 1.0)
-    x, total_mass = xi.ravel() * length, jnp.sum(mass_w)
+    left, right = pieces.left, pieces.right
+    total_mass, first_moment, inertia = (
+        jnp.sum(line_mass * (right**n - left**n) / n) for n in (1, 2, 3)
+    )
     coefficient = coefficient * jnp.sqrt(total_mass / 2 / softness)
 
     def slope(x: Array) -> Array:
         return coefficient.T @ shapes(x / length).slope / length
 
-    # products of two slopes have twice as many half-waves
-    xi, weight = (y.ravel() for y in _nodes(bends.pieces, length, 2 * n_sines + 16))
-    steepness = slope(xi * length)
+    # exact to rounding for products of two slopes, which have up to 2 n_sines half-waves
+    xi, weight = (y.ravel() for y in _nodes(bends.pieces, 2 * n_sines + 16))
+    steepness, weight = slope(xi * length), weight * length
     shortening = (steepness * weight) @ steepness.T
     # mass and first moment of what lies beyond a point, piece by piece
-    left, right = pieces.left[:, None], pieces.right[:, None]
-    rest = jnp.clip(xi * length, left, right)
-    line = line_mass[:, None]
+    left, right = left[:, None], right[:, None]
+    beyond_x = jnp.clip(xi * length, left, right)
     beyond = (
-        jnp.sum(line * (right - rest), axis=0),
-        jnp.sum(line * (right**2 - rest**2) / 2, axis=0),
+        jnp.sum(line_mass[:, None] * (right - beyond_x), axis=0),
+        jnp.sum(line_mass[:, None] * (right**2 - beyond_x**2) / 2, axis=0),
     )
     slopes, bent = static_bending(beam, patches, stations, has_patches=True)
     return ModalBasis(
@@ -460,11 +506,11 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
         mixed_shortening=shortening * (1 - jnp.eye(n_modes)),
         inward=(steepness * (weight * beyond[0])) @ steepness.T,
         centrifugal=(steepness * (weight * beyond[1])) @ steepness.T,
-        b=value @ mass_w @ coefficient,
-        c=value @ (mass_w * x) @ coefficient + joint @ ends.T @ coefficient,
+        b=length * integrals.single(line_mass, 0, small, rest) @ coefficient,
+        c=(length**2 * integrals.single(line_mass, 1, small, rest) + joint @ ends.T) @ coefficient,
         link_mass=total_mass,
-        first_moment=mass_w @ x,
-        inertia=mass_w @ x**2 + jnp.sum(joint),
+        first_moment=first_moment,
+        inertia=inertia + jnp.sum(joint),
         deflection_at=shapes(stations / length).value.T @ coefficient,
         sensor_slope=_slope_difference(slope, patches, patches.sensor_length),
         actuator_slope=_slope_difference(slope, patches, patches.actuator_length)
