@@ -79,6 +79,19 @@ class Structure(NamedTuple):
         """Patch pairs of the machine."""
         return self.n_links * self.n_patches
 
+    def without_run(self) -> Structure:
+        """Machine, controller and electronics: what a loop about rest depends on."""
+        return self._replace(
+            n_steps=1,
+            substeps=1,
+            n_frequencies=1,
+            has_hysteresis=False,
+            has_noise=False,
+            metrics=(),
+            is_linear=False,
+            is_smooth=True,
+        )
+
     @property
     def is_delayed(self) -> bool:
         """Whether commands change within samples."""

@@ -26,20 +26,21 @@ from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 
 #: Iterations at each frequency.
 ITERATIONS = 4
+#: A value is close to the axis where its imaginary part is less than this share of its real one.
+CLOSE = 0.2
 
 
 class Loci(NamedTuple):
     """State of the sweep: n eigenvalues, one for each channel."""
 
     value: Pair  # [1], (n,)
-    last: Pair  # at the last frequency where crossings were looked for [1], (n,)
-    omega: Array  # that frequency [rad/s], ()
-    # of the rightmost crossing of each curve: where it meets the axis [1], and the frequencies on
-    # either side [rad/s], (n,) each; 0: none
+    omega: Array  # where they have it [rad/s], (); 0: nowhere yet
+    # rightmost crossing of each curve by linear interpolation [1], and where [rad/s]; 0: none, (n,)
     crossing: Array
-    place: Array  # by linear interpolation
-    left: Array
-    right: Array
+    place: Array
+    # largest value close to the axis, crossing or not [1], and where [rad/s]; 0: none, (n,)
+    close: Array
+    close_at: Array
 
 
 class FrequencyPoint(NamedTuple):
@@ -48,17 +49,12 @@ class FrequencyPoint(NamedTuple):
     omega: Array  # [rad/s], rising, never 0, ()
     cosine: Array  # of omega T, ()
     sine: Array
-    # 0: only iterate; 1: start looking for crossings here; 2: look for them between the last
-    # frequency of this kind and this one, ()
-    kind: Array
 
 
 def start_loci(value: Pair) -> Loci:
     """State before the first station, with first guesses, (n, ...)."""
     zero = 0 * value.re
-    return Loci(
-        value=value, last=value, omega=zero[0], crossing=zero, place=zero, left=zero, right=zero
-    )
+    return Loci(value=value, omega=zero[0], crossing=zero, place=zero, close=zero, close_at=zero)
 
 
 def follow_loci(constants: tuple[LoopResponse, Array], station: FrequencyPoint, loci: Loci) -> Loci:
@@ -70,32 +66,37 @@ def follow_loci(constants: tuple[LoopResponse, Array], station: FrequencyPoint, 
         loci: so far.
     """
     response, spread = constants
-    s = Pair(_growth(response) + jnp.zeros_like(station.omega), station.omega)
-    shift = Pair(station.cosine, -station.sine) * (1 - RADIUS_TOLERANCE)
-    loop_gain = evaluate_loop_gain(response, s, shift, spread)
-    value, last = _improve_values(loop_gain, loci.value), loci.last
+    at = _axis(response, station.omega, station.cosine, station.sine)
+    loop_gain = evaluate_loop_gain(response, *at, spread)
+    value, last = _improve_values(loop_gain, loci.value), loci.value
     # where the straight line between two values meets the real axis
     rise = value.im - last.im
     was_above, is_above = last.im > 0, value.im > 0
     is_through = (was_above & ~is_above) | (is_above & ~was_above)
     share = jnp.where(is_through, -last.im / jnp.where(is_through, rise, 1.0), 0.0)
     meets = last.re + share * (value.re - last.re)
-    is_more = is_through & (station.kind > 1) & (meets > loci.crossing)
-    is_kept = station.kind > 0
+    is_more = is_through & (loci.omega > 0) & (meets > loci.crossing)
+    is_close = (jnp.abs(value.im) < CLOSE * value.re) & (value.re > loci.close)
     return Loci(
         value=value,
-        last=Pair(jnp.where(is_kept, value.re, last.re), jnp.where(is_kept, value.im, last.im)),
-        omega=jnp.where(is_kept, station.omega, loci.omega),
+        omega=station.omega,
         crossing=jnp.where(is_more, meets, loci.crossing),
         place=jnp.where(is_more, loci.omega + share * (station.omega - loci.omega), loci.place),
-        left=jnp.where(is_more, loci.omega, loci.left),
-        right=jnp.where(is_more, station.omega, loci.right),
+        close=jnp.where(is_close, value.re, loci.close),
+        close_at=jnp.where(is_close, station.omega, loci.close_at),
     )
 
 
-def _growth(response: LoopResponse) -> Array:
-    """Largest growth rate that counts as stable [1/s], ()."""
-    return RADIUS_TOLERANCE / response.period
+def _axis(response: LoopResponse, omega: Array, cosine: Array, sine: Array) -> tuple[Pair, Pair]:
+    """s and exp(-s T) at the largest growth rate that counts as stable."""
+    growth = RADIUS_TOLERANCE / response.period
+    return Pair(growth + 0 * omega, omega), Pair(cosine, -sine) * (1 - RADIUS_TOLERANCE)
+
+
+def loop_gain_on_axis(response: LoopResponse, omega: Array) -> LoopGain:
+    """L(j omega), (...)."""
+    angle = omega * response.period
+    return evaluate_loop_gain(response, *_axis(response, omega, jnp.cos(angle), jnp.sin(angle)))
 
 
 def _improve_values(loop_gain: LoopGain, values: Pair) -> Pair:
@@ -128,13 +129,12 @@ class AxisCrossing(NamedTuple):
     by_value: Pair
 
 
-class KnownCrossing(NamedTuple):
-    """A crossing point already found, to be excluded."""
+class Crossing(NamedTuple):
+    """Where an eigenvalue is real and positive."""
 
-    is_there: Array  # 1 or 0, ()
+    value: Array  # the eigenvalue [1], 0: nowhere, ()
     omega: Array  # [rad/s], ()
-    value: Array  # [1], ()
-    by_omega: Pair
+    by_omega: Pair  # slopes of det(x - L) there
     by_value: Pair
 
 
@@ -153,7 +153,7 @@ def start_crossing(omega: Array, value: Array, cosine: Array, sine: Array) -> Ax
 
 
 def refine_crossing(
-    constants: tuple[LoopResponse, KnownCrossing], _: tuple[()], crossing: AxisCrossing
+    constants: tuple[LoopResponse, Crossing], _: tuple[()], crossing: AxisCrossing
 ) -> AxisCrossing:
     """A step of Newton's iteration on det(x - L(j omega)) = 0 for real omega and x.
 
@@ -164,14 +164,15 @@ def refine_crossing(
     response, known = constants
     omega, value, zero = crossing.omega, crossing.value, jnp.zeros_like(crossing.omega)
     one = jnp.ones_like(zero)
-    shift = Pair(crossing.cosine, -crossing.sine) * (1 - RADIUS_TOLERANCE)
+    at = _axis(response, omega, crossing.cosine, crossing.sine)
+    shift = at[1]
 
     def remaining(loop_gain: LoopGain, omega: Array, x: Array) -> Pair:
         value = characteristic_polynomial(loop_gain, Pair(x, jnp.zeros_like(x)))
         away = known.by_omega * (omega - known.omega) + known.by_value * (x - known.value)
-        return value * (away * known.is_there + (1 - known.is_there)).inverse()
+        is_there = jnp.where(known.value > 0, one, zero)
+        return value * (away * is_there + (1 - is_there)).inverse()
 
-    at = (Pair(zero + _growth(response), omega), shift)
     shift_rate = shift * Pair(zero, -response.period * one)  # d/d omega of exp(-j omega T)
     loop_gain, gain_rate = jax.jvp(
         partial(evaluate_loop_gain, response), at, (Pair(zero, one), shift_rate)

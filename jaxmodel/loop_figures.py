@@ -6,6 +6,10 @@ import numpy as np
 
 from jaxmodel.parameters import Array
 
+#: Minimum number of plant modes for a margin: uncontrolled modes limit the gains [1].
+MARGIN_MODES = 12
+#: Margins above the first are reported as it, those below the second as 0 [1].
+HIGHEST, LOWEST = 64.0, 1e-6
 #: Lower limits of a loop, 0: it is unstable; upper ones, its largest singular values.
 MARGINS = ("disk_margin", "phase_margin", "delay_margin")
 PEAKS = ("sensitivity_peak", "control_effort_peak", "disturbance_deflection_peak")

@@ -174,19 +174,19 @@ _CHANNEL_FIELDS = (
 )
 
 
-def controlled_first(response: LoopResponse, link_mask: np.ndarray, count: int) -> LoopResponse:
-    """The same loops with controlled links first and no channels on the others; on the host.
+def controlled_first(response: LoopResponse, link_mask: Array, count: int) -> LoopResponse:
+    """The same loops with controlled links first and no channels on the others.
 
     Args:
         response: with channels on all links, lanes last.
         link_mask: above 0 for controlled links, (3, lanes).
         count: how many links keep channels, the largest number controlled in any lane (static).
     """
-    order = np.argsort(link_mask <= 0, axis=0, kind="stable")
+    order = jnp.argsort(link_mask <= 0, axis=0, stable=True)
 
     def moved(x: Array, most: int) -> Array:
         rows = order[:most].reshape(most, *(1,) * (x.ndim - 2), order.shape[1])
-        return np.take_along_axis(x, rows, axis=0)
+        return jnp.take_along_axis(x, rows, axis=0)
 
     parts = {
         name: jax.tree.map(partial(moved, most=most), getattr(response, name))
@@ -203,6 +203,8 @@ class AssembledModes(NamedTuple):
     decay: Array  # zeta omega [1/s], (m,)
     share: Array  # of kinetic energy in the pose, then in the links' modes by order, (1 + R, m)
     growth: Array  # growth rate of an unstable rest, 0: stable [1/s], ()
+    shape: Array  # coordinates of the links' modes in each, of modal mass 1, (n, R, m)
+    rigid: Array  # pose, and elongations if links lengthen, (p, m)
 
 
 def pose_coupling(whole: Assembled, xp: Any = jnp) -> Array:
@@ -237,12 +239,40 @@ def assembled_modes(response: LoopResponse | PlantResponse) -> AssembledModes:
     n_links, n_modes = response.square.shape
     energy, pose = shape * shape, len(whole.mass)
     links = jnp.sum(jnp.reshape(energy[pose:], (n_links, n_modes, -1)), axis=0)
+    rigid = factor.T @ shape[:pose]
     return AssembledModes(
-        jnp.sqrt(jnp.maximum(square, 0.0)),
-        jnp.sum(shape * (damping @ shape), axis=0) / 2,
-        jnp.concatenate([jnp.sum(energy[:pose], axis=0)[None], links]),
-        jnp.sqrt(jnp.maximum(-square[0], 0.0)),
+        omega=jnp.sqrt(jnp.maximum(square, 0.0)),
+        decay=jnp.sum(shape * (damping @ shape), axis=0) / 2,
+        share=jnp.concatenate([jnp.sum(energy[:pose], axis=0)[None], links]),
+        growth=jnp.sqrt(jnp.maximum(-square[0], 0.0)),
+        shape=jnp.reshape(shape[pose:] - drag.T @ rigid, (n_links, n_modes, -1)),
+        rigid=rigid,
     )
+
+
+def mode_strength(response: LoopResponse, modes: AssembledModes) -> Array:
+    """Largest eigenvalue of L due to each mode of the machine at its resonance, (m,).
+
+    It covers the mode's own part of L, which has rank one, without the other images: a measure of
+    size, not a bound.
+    """
+    n = response.observe.shape[0]
+    omega = jnp.maximum(modes.omega, 1.0)
+    shift = Pair(jnp.cos(omega * response.period), -jnp.sin(omega * response.period))
+    channel = jax.vmap(lambda re, im: _channel(response, Pair(re, im)), out_axes=2)(
+        shift.re, shift.im
+    )  # (n, C, m)
+    s = Pair(jnp.zeros_like(omega), omega)
+    passed = _electronics(response, s, s * s, -shift + 1.0)
+    seen, moved = (
+        jnp.einsum("icr,irm->icm", x, modes.shape[:n]) for x in (response.observe, response.act)
+    )
+    if response.longer is not None:
+        longer = modes.rigid[len(response.mass) :][:n, None]
+        seen = seen + response.read[..., None] * longer
+        moved = moved + response.push[..., None] * longer
+    gain = jnp.sum(jnp.abs(seen * moved) * _size(channel), axis=(0, 1)) * _size(passed)
+    return gain / (2 * omega * jnp.maximum(modes.decay, NARROWEST * omega))
 
 
 class LoopGain(NamedTuple):

@@ -10,13 +10,13 @@ import scipy.sparse.linalg
 from jaxmodel import sampled_loop
 from jaxmodel.linear import linearise, resting
 from jaxmodel.loop import coordinate_omega
+from jaxmodel.loop_figures import HIGHEST
 from jaxmodel.prepare import prepare
 from studies.engine.controller import fixed_controller
 from studies.engine.stability import gain_margin
 from studies.errors import StudyError
 from studies.spillover.plants import LoopBuilder, PlantVariant, pad_channels, plant_structure
 from studies.spillover.proofs import collect
-from studies.study.margin import HIGHEST
 from tests.bare import paper_study
 
 ONE_MOVE = paper_study().change(link__modes=3, motion__waypoints=paper_study().motion.waypoints[:2])

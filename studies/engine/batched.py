@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -16,11 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.case import Case, Structure
+from jaxmodel.judge import LoopVerdicts, can_judge, judge
 from jaxmodel.parameters import Array
 from jaxmodel.simulate import Result
+from jaxmodel.steps import scan_steps
 from studies.engine.function import BlockFunction, fastest_function
 from studies.engine.plan import STATIC, lane_unit, padded_rows
 from studies.engine.preflight import check_run
+from studies.engine.steps import has_kernels, kernel_steps
 from studies.errors import StudyError
 from studies.kernels.differentiable import outside
 from studies.study.cases import case_of, with_used
@@ -29,7 +32,7 @@ from studies.study.paths import known_field, overlaps
 from studies.study.spec import Study
 
 
-def batched(study: Study, names: Sequence[str]) -> Callable[[Array], Result]:
+def batched(study: Study, names: Sequence[str], is_judged: bool = False) -> Callable[[Array], Any]:
     """A study's results as a JAX function of some of its numbers, for many cases.
 
     A call runs its cases on one core; `jax.shard_map` divides them among several.
@@ -38,16 +41,18 @@ def batched(study: Study, names: Sequence[str]) -> Callable[[Array], Result]:
         study: what all cases share.
         names: of the numbers that vary, as in files: fields, which then have one value for all
             that they stand for, or entries of lists, such as `control.velocity_gain[0]`.
+        is_judged: also judge the loops, see `jaxmodel.judge`.
 
     Returns:
         A function of values (n, p), one column a name, in the units of the file, that gives the
-        results of n cases, leaves (n, ...). Its derivatives, forward and reverse, are those of the
-        smooth loop: converters without rounding, limits with round corners. It raises StudyError
-        for values of another shape. Unlike files it does not check ranges.
+        results of n cases, leaves (n, ...), or a pair of these and what is judged. Its
+        derivatives, forward and reverse, are those of the smooth loop: converters without
+        rounding, limits with round corners. It raises StudyError for values of another shape.
+        Unlike files it does not check ranges.
 
     Raises:
-        StudyError: as `check_run`, not a study, or a name that is none of its numbers. Call it
-            outside of `jit`.
+        StudyError: as `check_run`, not a study, a name that is none of its numbers, or a loop that
+            only its eigenvalues judge. Call it outside of `jit`.
 
     Example:
         >>> run = batched(load_study("paper"), ["control.gain_factor", "drive.kp"])
@@ -58,9 +63,19 @@ def batched(study: Study, names: Sequence[str]) -> Callable[[Array], Result]:
         raise StudyError(f"study: {study!r}; expected a study, as load_study returns")
     positions = _positions(study, names)
     structure = with_used(check_run(study)[0], [field for field, _ in positions])
+    run = _run(study, structure, positions)
+    if not is_judged:
+        return _check_shape(len(positions), run)
+    judged = _judge_program(study, structure, positions)
+    return _check_shape(len(positions), lambda values: (run(values), judged(values)))
+
+
+def _run(
+    study: Study, structure: Structure, positions: tuple[Any, ...]
+) -> Callable[[Array], Result]:
     exact = _batch_program(study, structure, positions)
     if structure.is_smooth:
-        return _check_shape(len(positions), exact)
+        return exact
     smooth = _batch_program(study, structure._replace(is_smooth=True), positions)
     rounded = jax.custom_jvp(exact)
 
@@ -68,7 +83,27 @@ def batched(study: Study, names: Sequence[str]) -> Callable[[Array], Result]:
     def rule(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Result, Result]:
         return exact(*primals), jax.jvp(smooth, primals, tangents)[1]
 
-    return _check_shape(len(positions), rounded)
+    return rounded
+
+
+def _judge_program(
+    study: Study, structure: Structure, positions: tuple[Any, ...]
+) -> Callable[[Array], LoopVerdicts]:
+    if not can_judge(structure):
+        raise StudyError(
+            f"is_judged: of control.feedback = {study.control.feedback!r}, control.law = "
+            f"{study.control.law!r} and drive.kind = {study.drive.kind!r}, with drive.lag = "
+            f"{study.drive.lag:g} s, only eigenvalues judge a loop: see loop_report"
+        )
+    shared, build = one_study(study, structure), _Build(structure, positions)
+    n_active = max(1, sum(study.control.links))
+    steps = partial(kernel_steps, []) if has_kernels() else scan_steps
+
+    def run(parameters: Array) -> LoopVerdicts:
+        cases = jax.vmap(lambda free: build(free, None, shared))(parameters)
+        return judge(structure, cases, steps, n_active)
+
+    return run
 
 
 def _positions(study: Study, names: Sequence[str]) -> tuple[Any, ...]:
@@ -91,10 +126,10 @@ def _is_real(value: Any) -> bool:
     return all(map(_is_real, value)) if is_list else isinstance(value, float)
 
 
-def _check_shape(count: int, run: Callable[[Array], Result]) -> Callable[[Array], Result]:
+def _check_shape(count: int, run: Callable[[Array], Any]) -> Callable[[Array], Any]:
     """The same for values that are what they should be."""
 
-    def checked(values: Array) -> Result:
+    def checked(values: Array) -> Any:
         try:
             array = jnp.asarray(values)
         except (TypeError, ValueError, OverflowError) as error:

@@ -16,13 +16,13 @@ from jaxmodel.changes import MachineChange, changed_loop
 from jaxmodel.controller import Controller, linear_parts
 from jaxmodel.delay import LONGEST as LONGEST_DELAY
 from jaxmodel.delay import true_delay
+from jaxmodel.judge import with_margin_modes
 from jaxmodel.laws.srf import SRF
 from jaxmodel.parameters import Array
 from studies.engine.controller import FixedController
 from studies.engine.host_loop import SampledLoop, name_motion
 from studies.engine.nearest import Loops, nearest_unstable
 from studies.engine.programs import kept_jit
-from studies.engine.stability import with_margin_modes
 from studies.errors import StudyError, field_error, nearest
 from studies.threads import serial_blas
 

@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from jaxmodel.loop_figures import MARGINS, MOST_DELAY
+from jaxmodel.loop_figures import HIGHEST, MARGIN_MODES, MARGINS, MOST_DELAY
 from jaxmodel.metrics import METRICS
 from jaxmodel.prepare import SPECTRUM_SPAN
 from studies.space.table import CaseTable, as_numbers
 from studies.store import Variable
 from studies.study.labels import DISTANCE_TEXT, STATION_TEXT, STATUS_LABEL
-from studies.study.margin import HIGHEST, MARGIN_MODES
 from studies.study.paths import field_unit, parse_entry
 from studies.study.spec import Study
 

@@ -77,7 +77,9 @@ class Preflight(NamedTuple):
 
 def preflight(structure: Structure, case: Case) -> Preflight:
     """What is known about a case before it runs, as NumPy arrays."""
-    return jax.tree.map(np.asarray, _preflight(_without_run(structure), case))
+    # whoever reads the controller finds all gains in it
+    plain = structure.without_run()._replace(feedback="none", has_position_gain=True)
+    return jax.tree.map(np.asarray, _preflight(plain, case))
 
 
 @kept_jit(static_argnums=0, is_quick=True)
@@ -119,35 +121,6 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
         controller=prepared.loop.controller,
         taps=prepared.taps,
     )
-
-
-def _without_run(structure: Structure) -> Structure:
-    """Only machine and controller, so that runs of any kind share a compilation."""
-    kept = (
-        "mechanism",
-        "n_modes",
-        "n_controlled",
-        "n_patches",
-        "basis",
-        "has_shortening",
-        "is_distributed",
-        "has_stretch",
-        "has_static_correction",
-        "is_coupled",
-        "has_wrench",
-        "has_joint_friction",
-        "has_drive_lag",
-        "controller_basis",
-        "law",
-        "drive",
-        "has_poles",
-        "has_amplifier",
-        "has_sensor_highpass",
-        "has_delay",
-        "has_notch",
-    )
-    fields = {name: getattr(structure, name) for name in kept}
-    return Structure(n_steps=1, feedback="none", **fields)
 
 
 def check_run(study: Study) -> tuple[Structure, Case]:
@@ -346,7 +319,7 @@ def _check_rates(study: Study, structure: Structure, prepared: Preflight) -> Non
 
 def pole_decay(structure: Structure, case: Case, pose: Any) -> float:
     """Fastest decay |Re lambda| [1/s] of the plant with ideal feedback at a pose."""
-    structure = _without_run(structure)._replace(feedback="ideal")
+    structure = structure.without_run()._replace(feedback="ideal", has_position_gain=True)
     poles = np.linalg.eigvals(np.asarray(_mechanics_at(structure, case, pose)))
     return float(np.abs(poles.real).max())
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.frequency_response import SampledLoopResponse, response_of_loop
+from jaxmodel.judge import with_margin_modes
 from jaxmodel.laws import LAWS
 from jaxmodel.loop import Loop
 from jaxmodel.loop_figures import MARGINS, MOST_DELAY, MOST_PHASE, PEAKS
@@ -32,7 +33,7 @@ from studies.engine.loop_gain import LoopGains, acting_commands, loop_gains
 from studies.engine.margin_grid import GridGain, search_grid
 from studies.engine.plan import padded_rows
 from studies.engine.programs import kept_jit
-from studies.engine.stability import modes_alone, with_margin_modes
+from studies.engine.stability import modes_alone
 from studies.threads import serial_blas
 
 #: Loops per call; each core takes one call after another.

@@ -15,6 +15,7 @@ from jaxmodel.beam import build_basis
 from jaxmodel.case import Case, Structure
 from jaxmodel.delay import command_change, true_delay
 from jaxmodel.hysteresis import added_voltage, advance_plays, design_hysteresis
+from jaxmodel.loop_figures import MARGIN_MODES
 from jaxmodel.metrics import METRICS
 from jaxmodel.prepare import left_out_deflection, spectrum_frequencies
 from jaxmodel.simulate import Result
@@ -25,7 +26,6 @@ from studies.engine.programs import kept_jit
 from studies.engine.runs import Run
 from studies.store import Variable, axis_sizes
 from studies.study.labels import STATUS_LABEL
-from studies.study.margin import MARGIN_MODES
 from studies.study.spec import Study
 
 

@@ -17,18 +17,19 @@ import numpy as np
 from jaxmodel.axial import axial_force
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, linear_parts
-from jaxmodel.drives import DRIVES
+from jaxmodel.judge import with_margin_modes
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.imsc import IMSC
 from jaxmodel.linear import Moment, resting
 from jaxmodel.loop import coordinate_omega
+from jaxmodel.loop_figures import HIGHEST, LOWEST, MARGIN_MODES
 from jaxmodel.motion import PathSample, end_of_path, sample_path
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, loop_matrices
 from studies.engine.host_loop import SampledLoop, name_motion, sampled_loop
 from studies.engine.programs import kept_jit
-from studies.study.margin import DAMPINGS, HIGHEST, LOWEST, MARGIN_MODES
+from studies.study.margin import DAMPINGS
 from studies.threads import serial_blas
 
 #: Largest ratio of successive gain factors [1].
@@ -68,39 +69,6 @@ class LoopFigures(NamedTuple):
     def is_stable(self) -> bool:
         """Whether this loop and every one with smaller gains is stable."""
         return self.spectral_radius <= 1 + RADIUS_TOLERANCE and self.gain_margin >= 1
-
-
-def with_margin_modes(
-    structure: Structure, case: Case, least: int = MARGIN_MODES
-) -> tuple[Structure, Case]:
-    """The same loop, or loops, with at least this many plant modes, before any motion."""
-    n_modes = max(least, structure.n_modes)
-    modes = np.maximum(least, np.asarray(case.n_modes))
-    still = np.zeros((*np.shape(case.initial.modal)[:-1], n_modes))
-    case = case._replace(n_modes=modes, initial=case.initial._replace(modal=still))
-    # drop everything a loop about rest does not depend on, which would cost a compilation
-    structure = structure._replace(
-        n_modes=n_modes,
-        n_steps=1,
-        substeps=1,
-        is_linear=False,
-        n_frequencies=1,
-        has_noise=False,
-        has_hysteresis=False,
-        has_joint_friction=False,
-        metrics=(),
-        is_smooth=True,
-        feedback="sampled",
-        has_position_gain=True,
-        drive=_about_rest(structure.drive),
-    )
-    return structure, case
-
-
-def _about_rest(drive: str) -> str:
-    """The drive whose small motions about rest are the same: PD if it only adds feed-forward."""
-    law, plain = DRIVES[drive], DRIVES["pd"]
-    return plain.name if law.force is plain.force and not law.is_sampled else drive
 
 
 def modes_alone(structure: Structure, cases: Case) -> list[tuple[Structure, Case]]:

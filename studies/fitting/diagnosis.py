@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxmodel.loop_figures import MARGIN_MODES
 from studies.errors import StudyError
 from studies.fitting.faults import Fault, fault_of
 from studies.fitting.kinds.contract import Measurement
@@ -23,7 +24,6 @@ from studies.fitting.solve import descend_all, follow
 from studies.fitting.spec import FitSpec, number_unit, parse_fit
 from studies.fitting.statistics import misfit
 from studies.space.free import plain_numbers
-from studies.study.margin import MARGIN_MODES
 from studies.study.paths import free_fields, known_field, parts_of
 from studies.study.spec import DESIGN, MACHINE
 

@@ -29,6 +29,8 @@ _EXTENSION, _KIND, _METADATA, _VERSION = 8, 8, 24, 24
 
 #: What keeps a handler alive: its machine code and its kernel, by its name.
 _HANDLERS: dict[str, tuple[Any, Kernel]] = {}
+#: Kernels by their names; handlers for several sizes share one.
+_KERNELS: dict[str, Kernel] = {}
 #: XLA takes a name once.
 _REGISTERING = Lock()
 
@@ -81,7 +83,9 @@ class CpuCall(LoopCall):
 
 def _register(call: CpuCall) -> tuple[Any, Kernel]:
     """Make a handler known to XLA; returns what keeps it alive."""
-    kernel = kept_kernel(call.name, call.make)
+    if call.name not in _KERNELS:
+        _KERNELS[call.name] = kept_kernel(call.name, call.make)
+    kernel = _KERNELS[call.name]
     if call.lanes % kernel.width:
         raise ValueError(f"lanes = {call.lanes}; allowed: multiples of {kernel.width}")
     text = _handler(

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxmodel.loop_figures import HIGHEST
 from studies.engine.chunks import Done, run_quietly
 from studies.engine.plan import local_layout, most_lanes, plan_groups
 from studies.engine.results import SweepData, counted_links, direction
@@ -22,7 +23,7 @@ from studies.space.spec import SweepSpec
 from studies.space.table import CaseTable, as_numbers, build_table, metric_sizes
 from studies.study.entries import parse_entries
 from studies.study.fields import Columns
-from studies.study.margin import ENOUGH, HIGHEST
+from studies.study.margin import ENOUGH
 
 #: Fewest and most designs of a shard.
 SHARD = (2**14, 2**18)

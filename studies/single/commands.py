@@ -165,12 +165,12 @@ def _numbers(option: str, written: str) -> tuple[float, ...]:
 
 def _print_run(run: Run, twin: Run | None, console: Console) -> None:
     """Print status, link metrics and stability; twin: the same run without control."""
+    from jaxmodel.loop_figures import MARGIN_MODES
     from studies.engine.poles import HEADER, difference, pole_rows
     from studies.show.listing import print_rows
     from studies.single.summary import limits_text, link_rows, machine_notes
     from studies.study.labels import describe, remedy
     from studies.study.margin import (
-        MARGIN_MODES,
         caution,
         hysteresis_text,
         margin_in_db,

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from jaxmodel import status
 from jaxmodel.axial import euler_force
+from jaxmodel.loop_figures import MARGIN_MODES
 from studies.engine.poles import HEADER, difference, pole_rows
 from studies.engine.run_data import chord_deflection
 from studies.engine.runs import Run
@@ -23,7 +24,7 @@ from studies.show.sketch import CAPTION
 from studies.show.units import is_cut_off, number
 from studies.show.words import control_text, motion_text
 from studies.single.summary import limits_text, link_rows, machine_notes, settling_text, watched
-from studies.study.margin import ENOUGH, MARGIN_MODES, caution, hysteresis_text, stretch_text
+from studies.study.margin import ENOUGH, caution, hysteresis_text, stretch_text
 
 #: Figures, by the end of the file name.
 #: What a run means, by its situation.

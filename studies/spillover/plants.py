@@ -19,6 +19,7 @@ from jaxmodel.controller import Controller, channel_parts
 from jaxmodel.laws.srf import SRF
 from jaxmodel.linear import resting
 from jaxmodel.loop import coordinate_omega
+from jaxmodel.loop_figures import MARGIN_MODES
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import placement_faults
 from jaxmodel.prepare import prepare
@@ -27,7 +28,6 @@ from studies.engine.controller import FixedController
 from studies.engine.host_loop import SampledLoop, sampled_loop
 from studies.engine.programs import kept_jit
 from studies.errors import field_error
-from studies.study.margin import MARGIN_MODES
 
 #: Plant modes per link at most.
 LARGEST = MARGIN_MODES
@@ -177,29 +177,18 @@ def plant_structure(design: FixedController, basis: str, n_modes: int) -> Struct
         basis: of the plant.
         n_modes: per link.
     """
-    nominal = design.structure
-    return Structure(
-        mechanism=design.structure.mechanism,
+    nominal = design.structure.without_run()
+    return nominal._replace(
         n_modes=n_modes,
-        n_controlled=nominal.n_controlled,
-        n_patches=nominal.n_patches,
-        n_steps=1,
-        n_frequencies=1,
         basis=basis,
-        has_shortening=nominal.has_shortening,
-        is_distributed=nominal.is_distributed,
+        controller_basis=Structure().controller_basis,
         has_stretch=nominal.has_stretch and BASES[basis].is_on_chord,
-        has_static_correction=nominal.has_static_correction,
+        feedback="sampled",
         law=SRF.name,
-        drive=nominal.drive,
-        has_friction=nominal.has_friction,
-        has_drive_lag=nominal.has_drive_lag,
+        has_notch=False,
+        has_joint_friction=False,
+        has_poles=False,
         has_position_gain=False,
-        is_coupled=nominal.is_coupled,
-        has_wrench=nominal.has_wrench,
-        has_sensor_highpass=nominal.has_sensor_highpass,
-        has_amplifier=nominal.has_amplifier,
-        has_delay=nominal.has_delay,
     )
 
 

@@ -7,18 +7,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from jaxmodel.hysteresis import PLAYS, slope_at_limit
-from jaxmodel.loop_figures import MOST_DELAY, MOST_PHASE, guaranteed_range
-
-#: Minimum number of plant modes for a margin: uncontrolled modes limit the gains [1].
-MARGIN_MODES = 12
-
+from jaxmodel.loop_figures import HIGHEST, MOST_DELAY, MOST_PHASE, guaranteed_range
 
 #: Margins below this are pointed out [1].
 ENOUGH = 2.0
-
-
-#: Margins above the first are reported as it, those below the second as 0 [1].
-HIGHEST, LOWEST = 64.0, 1e-6
 
 
 #: What stands beside margins and proofs.

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaxmodel import status
+from jaxmodel.loop_figures import HIGHEST
 from studies.engine.results import (
     SweepData,
     direction,
@@ -28,7 +29,7 @@ from studies.show.units import is_cut_off, readable
 from studies.show.words import baseline_text
 from studies.space.table import CaseTable, case_study
 from studies.study.fields import Fields
-from studies.study.margin import ENOUGH, HIGHEST
+from studies.study.margin import ENOUGH
 from studies.sweeps.records import BESIDE, MARGIN, is_there, reason, watched
 from studies.sweeps.sensitivity import scalar_columns
 from studies.sweeps.show import (

@@ -16,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxmodel import status
+from jaxmodel.loop_figures import HIGHEST
 from studies.engine.columns import LEFT_OUT
 from studies.engine.front import pareto_front
 from studies.engine.results import SweepData, as_sweep, metric_values, swept_names
@@ -24,7 +25,7 @@ from studies.show import figures
 from studies.show.sketch import ACTUATOR, SENSOR
 from studies.space.axes import SHOWN_AS
 from studies.space.spec import BlockNode
-from studies.study.margin import ENOUGH, HIGHEST
+from studies.study.margin import ENOUGH
 from studies.sweeps.records import MARGIN
 from studies.sweeps.show import label, left_out_text, recommended, shown_metric, shown_value
 

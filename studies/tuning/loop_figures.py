@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.kinematics import singularity_distance
-from jaxmodel.loop_figures import MARGINS, PEAKS
+from jaxmodel.loop_figures import MARGIN_MODES, MARGINS, PEAKS
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopMatrices, closed_loop, spillover
@@ -28,7 +28,6 @@ from studies.engine.robustness import judge_robustness
 from studies.engine.stability import gain_margin
 from studies.study.cases import as_arrays, build_cases, build_structure
 from studies.study.fields import Columns
-from studies.study.margin import MARGIN_MODES
 from studies.study.paths import parts_of
 from studies.study.spec import Study
 from studies.threads import serial_blas
@@ -71,15 +70,8 @@ def with_margin_modes(study: Study) -> Study:
 
 def judged_structure(spec: TuneSpec, study: Study) -> Structure:
     """Program of the linearised loop of a study's law and drive."""
-    # without what the matrices do not depend on, to avoid a compilation
-    return build_structure(with_margin_modes(study))._replace(
-        n_steps=1,
-        substeps=1,
-        n_frequencies=1,
-        has_noise=False,
-        metrics=(),
-        has_position_gain=spec.has_position_gain(parts_of(study)),
-    )
+    structure = build_structure(with_margin_modes(study)).without_run()
+    return structure._replace(has_position_gain=spec.has_position_gain(parts_of(study)))
 
 
 def loop_figures(spec: TuneSpec, study: Study) -> DesignFigures:

@@ -10,7 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from jaxmodel import status
-from jaxmodel.loop_figures import MARGINS, PEAKS
+from jaxmodel.loop_figures import MARGIN_MODES, MARGINS, PEAKS
 from jaxmodel.metrics import METRICS
 from studies.engine.fidelity import rank_correlation
 from studies.engine.poles import HEADER, difference, pole_rows
@@ -19,7 +19,7 @@ from studies.show.pages import page
 from studies.show.sketch import CAPTION
 from studies.show.units import headed, is_cut_off, number, readable, settling_text
 from studies.study.entries import parse_entries
-from studies.study.margin import MARGIN_MODES, caution, margin_in_db, margin_text
+from studies.study.margin import caution, margin_in_db, margin_text
 from studies.study.template import study_template, toml_text
 from studies.tuning.audit import ALLOWED, MEANING, Disagreement
 from studies.tuning.check import JudgedDesign, RandomSearch, patch_centers

@@ -38,6 +38,7 @@ OF_ONE_MACHINE = (
 #: Threes and sixes that count something else: coefficients, stages of a step, entries of a message.
 OTHERS = {
     "jaxmodel/actuation.py": ("range(3)",),
+    "jaxmodel/damping.py": ("np.ones(6)",),
     "jaxmodel/dynamics.py": ("len(m) == 3",),
     "jaxmodel/frequency_response.py": ("range(3)",),
     "jaxmodel/laws/contract.py": (":3",),
@@ -47,7 +48,6 @@ OTHERS = {
     "jaxmodel/trigonometry.py": ("range(3)",),
     "studies/cluster/connect.py": (":3", "len(faults) > 3"),
     "studies/commission/run.py": (":3",),
-    "studies/engine/damping.py": ("np.ones(6)",),
     "studies/engine/disk_margin.py": (
         "_local_maxima(grid.omega, value).reshape(-1, 3)",
         "bracket.reshape(n, FOLLOWED, 3)",

@@ -15,6 +15,7 @@ import pytest
 from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
 from jaxmodel.delay import LONGEST
+from jaxmodel.loop_figures import MARGIN_MODES
 from jaxmodel.prepare import design_controller
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, closed_loop
 from jaxmodel.simulate import simulate
@@ -23,7 +24,6 @@ from studies.engine.preflight import check_run
 from studies.engine.robustness import judge_robustness
 from studies.engine.stability import gain_margin, loop_report, with_margin_modes
 from studies.study.cases import as_arrays, build_case, build_structure
-from studies.study.margin import MARGIN_MODES
 from studies.study.spec import Study
 from tests.bare import parse_study
 from tests.machines import random_machine

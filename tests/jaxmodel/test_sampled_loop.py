@@ -11,6 +11,7 @@ import scipy.linalg
 from jaxmodel import sampled_loop
 from jaxmodel.linear import linearise, natural_modes
 from jaxmodel.linear_residual import linear_residual
+from jaxmodel.loop_figures import LOWEST
 from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import (
@@ -23,7 +24,6 @@ from studies.engine.programs import kept_jit
 from studies.engine.runs import _simulate
 from studies.engine.stability import gain_margin, loop_report
 from studies.study.cases import as_arrays, build_case, build_structure
-from studies.study.margin import LOWEST
 from tests import DATA
 from tests.bare import paper_study
 from tests.elements import plant_of_elements

@@ -13,9 +13,11 @@ from jax.sharding import AxisType, PartitionSpec
 from jaxmodel import status
 from studies.engine.batched import batched
 from studies.engine.runs import run_study
+from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.kernels import bridge, native
 from studies.kernels.traced import InputLeaf, trace_loop
+from studies.study.cases import as_arrays, build_case, build_structure
 from tests.canonical import TINY, study_of
 
 #: One mode and one patch, which make small programs.
@@ -28,6 +30,7 @@ STUDY = study_of(
     control__modes=1,
     control__ratios=[[1.0]] * 3,
 )
+HOME = np.array(STUDY.motion.waypoints[0])
 #: Gains, a number of the shaper, which moves the reference, and a blow on all sliders.
 NAMES = ("control.gain_factor", "shaper.tolerance", "drive.pulse_force")
 
@@ -230,3 +233,47 @@ def test_lanes_fill_vectors():
             trace_loop(lambda *x: x[2], [], [], [InputLeaf((), True)], float), 5, 3
         ).kernel()
     assert native.this_processor().vector_bytes in (16, 32, 64)
+
+
+def test_it_judges_the_loops_in_the_same_program(parameters):
+    """As eigenvalues do; nothing asks the host."""
+    run = batched(STUDY, NAMES, is_judged=True)
+    values = jax.device_put(parameters[:3])
+    traced = jax.jit(lambda values: run(values)[1]).trace(values)
+    assert not re.search("callback|infeed|outfeed", str(traced.jaxpr))
+    program = traced.lower().compile()
+    with jax.transfer_guard("disallow"):
+        judged = jax.block_until_ready(program(values))
+    assert np.all(judged.is_known)
+    for k, factor in enumerate(parameters[:3, 0]):
+        study = STUDY.change(control__gain_factor=float(factor))
+        one = loop_report(build_structure(study), as_arrays(build_case(study)), HOME, 1)
+        np.testing.assert_allclose(judged.gain_margin[k], one.gain_margin, rtol=1e-3)
+        np.testing.assert_allclose(judged.least_damping[k], one.damping_ratio.min(), rtol=2e-3)
+
+
+def test_gain_margins_have_derivatives():
+    """By the gain and by what moves modes and patches, as differences have them."""
+    names = ("control.gain_factor", "link.thickness", "drive.kp")
+    run = batched(STUDY, names, is_judged=True)
+    start = np.array([[0.1, STUDY.link.thickness, STUDY.drive.kp]])
+    margins = jax.jit(lambda values: run(values)[1].gain_margin)
+    (slope,) = jax.jit(jax.grad(lambda values: jnp.sum(run(values)[1].gain_margin)))(start)
+    wide = start + np.concatenate([np.diag(1e-5 * start[0]), -np.diag(1e-5 * start[0])])
+    ends = np.asarray(margins(wide)).reshape(2, 3)
+    wanted = (ends[0] - ends[1]) / (2e-5 * start[0])
+    np.testing.assert_allclose(slope, wanted, rtol=1e-5)
+    np.testing.assert_allclose(slope[0], -margins(start)[0] / 0.1, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"control__law": "lqg"}, "control.law = 'lqg'"),
+        ({"control__feedback": "none"}, "control.feedback = 'none'"),
+        ({"drive__lag": 1e-3}, "drive.lag = 0.001 s"),
+    ],
+)
+def test_loops_that_only_eigenvalues_judge_are_named(changes, named):
+    with pytest.raises(StudyError, match=re.escape(named)):
+        batched(STUDY.change(**changes), NAMES, is_judged=True)

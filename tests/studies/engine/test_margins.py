@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from functools import cache
 from unittest import mock
 
 import jax
@@ -11,25 +12,25 @@ import numpy as np
 import pytest
 
 from jaxmodel import status
+from jaxmodel.damping import least_controlled
+from jaxmodel.judge import LEAST_DAMPED, _respond
 from jaxmodel.laws import n_channels
+from jaxmodel.loop_figures import HIGHEST, LOWEST
 from jaxmodel.pairs import Pair
 from jaxmodel.return_difference import (
     characteristic_polynomial,
     controlled_first,
     evaluate_loop_gain,
 )
-from studies.engine import lanes
-from studies.engine.damping import least_controlled
+from studies.engine import steps
 from studies.engine.eigenvalues import eigenvalues
-from studies.engine.lanes import BLOCK
-from studies.engine.margins import LEAST_DAMPED, _respond, judge_loops
+from studies.engine.margins import judge_loops
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.results import read_sweep
 from studies.engine.stability import loop_report, with_margin_modes
 from studies.engine.sweep import run_sweep
 from studies.space.table import build_table
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure
-from studies.study.margin import HIGHEST, LOWEST
 from studies.sweeps.show import ranked_cases
 from tests.bare import parse_sweep
 from tests.canonical import MACHINE, study_of
@@ -82,9 +83,13 @@ def looked_at(study, pose):
 
 
 def response_of(structure, cases):
-    """Of the first case, by the program that judges batches; lanes last."""
-    block = jax.tree.map(lambda x: np.repeat(x[:1], BLOCK, axis=0), cases)
-    return jax.tree.map(lambda x: np.asarray(x)[..., :1], _respond(structure, block)[0])
+    """Of the first case, lanes last."""
+    return jax.tree.map(np.asarray, responding(structure)(jax.tree.map(lambda x: x[:1], cases)))
+
+
+@cache
+def responding(structure):
+    return jax.jit(jax.vmap(lambda case: _respond(structure, case)[0], out_axes=-1))
 
 
 @jax.jit
@@ -351,10 +356,10 @@ def test_scan_gives_the_same_as_kernels(monkeypatch):
     assert np.sum(is_single) > 3
     loops = loops._replace(cases=jax.tree.map(lambda x: x[is_single], loops.cases))
     kernels = judge_loops(*loops)
-    monkeypatch.setattr(lanes, "is_available", lambda: False)
-    lanes._runner.cache_clear()
+    steps._PROGRAMS.clear()
+    monkeypatch.setattr(steps.llvm, "is_available", lambda: False)
     scanned = judge_loops(*loops)
-    lanes._runner.cache_clear()
+    steps._PROGRAMS.clear()
     for one, other in zip(jax.tree.leaves(kernels), jax.tree.leaves(scanned), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-6)
 

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from studies.engine import executor, function, lanes
+from studies.engine import executor, function, steps
 from studies.engine.batched import batched
 from studies.engine.executor import Executor
 from studies.engine.function import STEPPERS
 from studies.errors import NoKernelError, NoKernelWarning
-from studies.kernels import cpu, graph
+from studies.kernels import bridge, graph
 from studies.kernels.equations import call_of, literal, scan_of, trace
 from tests.bare import bare
 from tests.canonical import study_of, text_of
@@ -201,16 +201,24 @@ def halved(constants, row, state):
     return jax.tree.map(lambda x: 0.5 * x + constants + row, state)
 
 
+def stepped(steps, given):
+    """Three steps over five lanes."""
+    return steps(halved, given, np.ones((3,)), np.arange(5.0), 3)
+
+
 def test_steps_over_lanes_without_a_kernel(monkeypatch):
-    given = np.linspace(0.1, 1, 5), np.ones((3,)), np.arange(5.0), 3
-    wanted = lanes.run_steps(halved, *given)
-    lanes._runner.cache_clear()
+    given = np.linspace(0.1, 1, 5)
+    wanted = steps.program_of_steps(stepped, [], given)(given)
+    steps._PROGRAMS.clear()
 
     def failing(*_):
         raise NoKernelError("LLVM cannot compile the traced kernel: unknown processor")
 
-    monkeypatch.setattr(cpu, "kept_kernel", failing)
+    monkeypatch.setattr(bridge, "kept_kernel", failing)
+    bridge._HANDLERS.clear()
+    bridge._KERNELS.clear()
     with pytest.warns(NoKernelWarning, match="unknown processor; XLA's scan runs instead"):
-        found = lanes.run_steps(halved, *given)
-    lanes._runner.cache_clear()
+        found = steps.program_of_steps(stepped, [], given)(given)
+    steps._PROGRAMS.clear()
     np.testing.assert_allclose(found, wanted, rtol=1e-15)
+    np.testing.assert_allclose(found[0], 0.5**3 * 0 + 1.1 * (1 + 0.5 + 0.25), rtol=1e-15)

@@ -1,0 +1,167 @@
+"""Elementwise steps over lanes as traced kernels, in programs that are kept with them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from threading import Lock
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.steps import scan_steps
+from studies.config import is_keeping
+from studies.engine.plan import lane_unit
+from studies.engine.programs import kept_data, program, quick_options
+from studies.errors import NoKernelError, warn_of_scan
+from studies.kernels import bridge, llvm
+from studies.kernels.differentiable import outside
+from studies.kernels.traced import InputLeaf, trace_loop
+
+#: Programs kept in memory; one thread makes them.
+KEPT = 16
+_PROGRAMS: dict[str, Callable[[Any], Any]] = {}
+_MAKING = Lock()
+
+
+def has_kernels() -> bool:
+    """Whether this machine's cores can run steps as kernels."""
+    return llvm.is_available() and bridge.is_available()
+
+
+def kernel_steps(
+    calls: list[bridge.CpuCall],
+    step: Callable[..., Any],
+    constants: Any,
+    inputs: Any,
+    state: Any,
+    n_steps: int,
+) -> Any:
+    """See `jaxmodel.steps.Steps`.
+
+    Args:
+        calls: where every call of a kernel is noted.
+        step, constants, inputs, state, n_steps: as there.
+    """
+    parts = [jax.tree.flatten(part) for part in (constants, inputs, state)]
+    (given, _), (rows, _), (first, tree) = parts
+    dtype, lanes = jax.dtypes.canonicalize_dtype(np.float64), first[0].shape[-1]
+    more = -lanes % lane_unit()
+    varies = tuple(x.ndim > 1 for x in rows)
+    trees = tuple(part[1] for part in parts)
+    shapes = tuple(tuple(x.shape[:-1] for x in part) for part in (given, first))
+
+    def flat(*leaves: list[Any]) -> list[Any]:
+        return jax.tree.leaves(step(*map(jax.tree.unflatten, trees, leaves)))
+
+    def make() -> Any:
+        constant, own = ([InputLeaf(shape, True) for shape in part] for part in shapes)
+        row = [InputLeaf((), is_wide) for is_wide in varies]
+        # functions called more than once compile in a third of the time
+        return outside(trace_loop, flat, constant, row, own, dtype, 0, True)
+
+    def filled(x: Any, is_wide: bool = True) -> Any:
+        width = [(0, 0)] * (x.ndim - 1) + [(0, more)]
+        return jnp.pad(jnp.asarray(x, dtype), width, mode="edge") if is_wide and more else x
+
+    call = bridge.CpuCall(
+        name=f"{step.__name__} {dtype} {trees[0]} {shapes} {varies}",
+        make=make,
+        n_given=len(given) + len(rows),
+        state=shapes[1],
+        records=(),
+        dtype=dtype,
+        n_steps=n_steps,
+        lanes=lanes + more,
+    )
+    calls.append(call)
+    arrays = [*map(filled, given), *map(filled, rows, varies), *map(filled, first)]
+    return jax.tree.unflatten(tree, [x[..., :lanes] for x in call(arrays)])
+
+
+def program_of_steps(
+    function: Callable[..., Any], names: list[Any], example: Any
+) -> Callable[[Any], Any]:
+    """`_program_of_steps`, made once in this process."""
+    shapes = jax.tree.map(jnp.shape, example)
+    key = repr((function.__qualname__, names, shapes, is_keeping()))
+    with _MAKING:
+        if key not in _PROGRAMS:
+            while len(_PROGRAMS) >= KEPT:
+                del _PROGRAMS[next(iter(_PROGRAMS))]
+            _PROGRAMS[key] = _program_of_steps(function, names, example)
+        return _PROGRAMS[key]
+
+
+def _program_of_steps(
+    function: Callable[..., Any], names: list[Any], example: Any
+) -> Callable[[Any], Any]:
+    """The program of `function(*names, steps, example)`, which runs its steps as kernels.
+
+    Args:
+        function: of a module; its last arguments are `steps` and what varies.
+        names: its other arguments, by which the program is known.
+        example: of what varies.
+
+    Returns:
+        A function of the latter, whose results are there when it returns.
+    """
+    if not has_kernels():
+        return _compiled(function, names, example, scan_steps)
+    names, module = [function.__qualname__, *names], function.__module__
+
+    def trace() -> list[bridge.CpuCall]:
+        calls: list[bridge.CpuCall] = []
+        jax.eval_shape(partial(function, *names[1:], partial(kernel_steps, calls)), example)
+        return calls
+
+    def facts() -> list[bridge.CpuCall]:
+        return [replace(call, make=_nothing) for call in trace()]
+
+    def made(name: str) -> Any:
+        return next(call.make() for call in trace() if call.name == name)
+
+    calls: list[bridge.CpuCall] = []
+    try:
+        if is_keeping():  # a program from disk is not traced, so nothing else makes its kernels
+            known = ["kernels of", *names, str(jax.tree.map(jnp.shape, example))]
+            for call in kept_data(known, facts, module):
+                calls.append(replace(call, make=partial(made, call.name)))
+                calls[-1].kernel()
+        run = _compiled(function, names[1:], example, partial(kernel_steps, calls))
+    except NoKernelError as error:
+        warn_of_scan(error)
+        return _compiled(function, names[1:], example, scan_steps)
+    kernels = {call.target: call.kernel() for call in calls}
+
+    def timed(given: Any) -> Any:
+        began = time.perf_counter()
+        result = jax.block_until_ready(run(given))
+        for kernel in kernels.values():  # those that run for long are compiled better
+            kernel.note_run((time.perf_counter() - began) / len(kernels))
+        return result
+
+    return timed
+
+
+def _nothing() -> Any:
+    raise NotImplementedError
+
+
+def _compiled(
+    function: Callable[..., Any], names: list[Any], example: Any, steps: Any
+) -> Callable[[Any], Any]:
+    options = None if steps is scan_steps else quick_options()
+
+    def lower() -> Any:
+        whole = jax.jit(partial(function, *names, steps), compiler_options=options)
+        return whole.lower(example)
+
+    kind = "scan" if steps is scan_steps else "kernels"
+    known = [function.__qualname__, kind, *names]
+    run: Callable[[Any], Any] = program(known, [example], lower, function.__module__)
+    return run
