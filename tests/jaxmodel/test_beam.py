@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxmodel import piezo
+from jaxmodel.bases import find_bases
 from jaxmodel.beam import BASES, build_basis, held_frequency, pinned_free_roots
 from jaxmodel.mechanisms.prrr.paper import paper_machine
 from jaxmodel.parameters import Damping
@@ -181,6 +182,21 @@ def test_frequencies_of_held_ends():
         np.testing.assert_allclose(found, frequencies_hz(low_basis(like, soft)), rtol=1e-12)
     bare = np.asarray(held_frequency("pinned_free", BEAM, low_basis("pinned_free"))) / (2 * np.pi)
     np.testing.assert_allclose(bare, np.tile([114.39, 457.55, 1029.5], (3, 1)), rtol=5e-5)
+
+
+def test_the_controller_s_model_has_nominal_stiffness():
+    nominal, soft = (
+        paper_study().change(link__basis="loaded", link__stiffness_factor=factor)
+        for factor in ((1.0,) * 3, (1.0, 0.8, 1.3))
+    )
+    structure = build_structure(nominal)._replace(controller_basis="loaded")
+    wanted, found = (find_bases(structure, as_arrays(build_case(x))) for x in (nominal, soft))
+    for name in ("stiffness", "mass", "sensor_slope", "static_slope", "static_deflection"):
+        one, other = (getattr(bases.model, name) for bases in (found, wanted))
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(other).max())
+    np.testing.assert_allclose(
+        found.plant.stiffness, wanted.plant.stiffness * np.array([[1.0], [0.8], [1.3]]), rtol=1e-9
+    )
 
 
 def test_high_pinned_free_modes_do_not_overflow():

@@ -84,7 +84,8 @@ def judged(response):
         if growth is not None:
             modes = modes._replace(growth=growth)
         each = np.array([3.0, 2.0, 1.0])[:, None] * np.ones(N) * 1e-9
-        return gain_margins(whole, modes, (np.full(N, 30.0 * strength), each), steps)
+        whole_strength = np.full(N, 30.0 * strength)
+        return jax.jit(lambda *x: gain_margins(*x, steps))(whole, modes, (whole_strength, each))
 
     return judge
 
