@@ -500,7 +500,9 @@ def response_of_loop(
     return SampledLoopResponse(plant_response(structure, case, loop, pose), loop.controller)
 
 
-def command_gain(response: SampledLoopResponse, omega: Array, delay: Array | None = None) -> Array:
+def command_gain(
+    response: SampledLoopResponse, omega: Array, delay: Array | None = None, is_exact: bool = True
+) -> Array:
     """L(e^(j omega T)) = -K P where the commands are: I + L is the return difference, (3 K, 3 K).
 
     P has the hold, computing delay, amplifier, links and pose, patches, anti-alias
@@ -510,12 +512,23 @@ def command_gain(response: SampledLoopResponse, omega: Array, delay: Array | Non
         response: of the loop.
         omega: above 0 and up to pi/T [rad/s], ().
         delay: more delay [samples], (); None: none.
+        is_exact: all images; otherwise `FEW`, for searches.
     """
-    plant, order = response.plant, np.arange(-IMAGES, IMAGES + 1)
+    plant = response.plant
     late = plant.late if delay is None else plant.late + delay
-    turned = image_weights(late) * jnp.exp(-1j * omega * plant.period * late)
+    turned, order = _turns(plant, omega, late, is_exact)
     sensed = jnp.einsum("n,nab->ab", turned, plant_images(plant, omega, order).sensed)
     return -controller_response(response.controller, jnp.exp(1j * omega * plant.period)) @ sensed
+
+
+def _turns(
+    plant: PlantResponse, omega: Array, delay: Array, is_exact: bool
+) -> tuple[Array, np.ndarray]:
+    """Weights of images behind a delay [samples], and their numbers, (I,) each."""
+    most = IMAGES if is_exact else FEW
+    order = np.arange(-most, most + 1)
+    turned = image_weights(delay) if is_exact else jnp.exp(-2j * np.pi * delay * order)
+    return turned * jnp.exp(-1j * omega * plant.period * delay), order
 
 
 class ClosedLoop(NamedTuple):
@@ -537,14 +550,12 @@ def close_loop(response: SampledLoopResponse, omega: Array, is_exact: bool = Tru
         is_exact: all images; otherwise `FEW`, for searches.
     """
     plant = response.plant
-    most = IMAGES if is_exact else FEW
-    order = np.arange(-most, most + 1)
+    order = _turns(plant, omega, plant.late, is_exact)[1]
     images = plant_images(plant, omega, order)
     z = jnp.exp(1j * omega * plant.period)
 
     def sampled(parts: Array, delay: Array) -> Array:
-        turned = image_weights(delay) if is_exact else jnp.exp(-2j * np.pi * delay * order)
-        return jnp.einsum("n,nab->ab", turned * z**-delay, parts)
+        return jnp.einsum("n,nab->ab", _turns(plant, omega, delay, is_exact)[0], parts)
 
     now, late = jnp.zeros(()), plant.late
     gain = controller_response(response.controller, z)

@@ -79,7 +79,7 @@ def delay_margins(loops: LoopGains, grid: GridGain) -> MarginPlace:
     later = grid._replace(radius=np.maximum(grid.radius, perron_radius(turned)))
     omega, gain, at_once = _searched(loops, later)
     n = len(omega)
-    angle = omega * loops.plant.period[:, None]
+    angle = omega * loops.period[:, None]
     half = loops.at_delay(omega, np.full(omega.shape, 0.5))
     change = np.linalg.norm(half * np.exp(0.5j * angle)[..., None, None] - gain, axis=(2, 3))
     is_mixed = change > MATTERS * np.linalg.norm(gain, axis=(2, 3))
@@ -146,7 +146,7 @@ def _tops(omega: np.ndarray, size: np.ndarray) -> np.ndarray:
 
 def _delays(loops: LoopGains, places: _Places) -> tuple[np.ndarray, np.ndarray]:
     """Delays that turn an eigenvalue into -1 [samples] without images, and rates of its log."""
-    angle = places.omega * loops.plant.period[places.loop]
+    angle = places.omega * loops.period[places.loop]
     return np.mod(places.log.imag, 2 * np.pi) / angle, -1j * angle
 
 
@@ -241,7 +241,7 @@ def _at_levels(
         places = _crossings(omega, value, np.arange(n), np.full(n, step))
         found.append(places.chosen(_is_in(is_mixed, places)))
     places = _looked_again(loops, _joined(found))
-    part, period = loops.part(places.loop), loops.plant.period[places.loop]
+    part, period = loops.part(places.loop), loops.period[places.loop]
     # both at the same frequency: between the grid's, where places lie, angles are not exact
     now, later = (
         -np.linalg.eigvals(part.at_delay(places.omega[:, None], places.level[:, None] + more)[:, 0])

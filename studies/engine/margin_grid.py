@@ -10,7 +10,7 @@ from jaxmodel.return_difference import NARROWEST
 from jaxmodel.robustness import LOWEST_HZ
 from jaxmodel.state_space import StateSpace
 from studies.engine.diagonal_scaling import balanced, largest_singular
-from studies.engine.loop_gain import LoopGains, ModalSystem
+from studies.engine.loop_gain import LoopGains
 
 #: Frequencies evenly on a logarithmic axis, and beside each mode that matters, in half-widths.
 BACKGROUND, BESIDE = 40, np.tan(np.array([-1.35, -0.75, 0.75, 1.35]))
@@ -45,12 +45,9 @@ def search_grid(loops: LoopGains, omega: np.ndarray, decay: np.ndarray) -> GridG
     def folded(x: np.ndarray) -> np.ndarray:  # after aliasing
         return np.clip(np.abs((x + top) % (2 * top) - top), lowest, top * (1 - 1e-6))
 
-    feedback = loops.controller.feedback
-    if isinstance(feedback, StateSpace | ModalSystem):
-        if isinstance(feedback, ModalSystem):
-            pole = feedback.pole.reshape(len(top), -1)
-        else:
-            pole = np.linalg.eigvals(feedback.state).reshape(len(top), -1)
+    feedback = loops.response.controller.feedback
+    if isinstance(feedback, StateSpace):
+        pole = np.linalg.eigvals(feedback.state[loops.owner]).reshape(len(top), -1)
         rate = np.log(np.maximum(np.abs(pole), 1e-9)) * top / np.pi
         omega = np.concatenate([omega, np.abs(np.angle(pole)) * top / np.pi], axis=1)
         decay = np.concatenate([decay, np.abs(rate)], axis=1)

@@ -56,7 +56,6 @@ OTHERS = {
     "studies/engine/folder.py": (":3",),
     "studies/engine/function.py": (":3",),
     "studies/engine/host_loop.py": ("range(3)",),
-    "studies/engine/loop_gain.py": ("1:3", ":3", "range(3)"),
     "studies/engine/margins.py": ("np.full((3, count), np.nan)",),
     "studies/engine/poles.py": (":3",),
     "studies/engine/run_data.py": (":3",),
