@@ -96,12 +96,11 @@ def _judge_program(
             f"{study.drive.lag:g} s, only eigenvalues judge a loop: see loop_report"
         )
     shared, build = one_study(study, structure), _Build(structure, positions)
-    n_active = max(1, sum(study.control.links))
     steps = partial(kernel_steps, []) if has_kernels() else scan_steps
 
     def run(parameters: Array) -> LoopVerdicts:
         cases = jax.vmap(lambda free: build(free, None, shared))(parameters)
-        return judge(structure, cases, steps, n_active)
+        return judge(structure, cases, steps, max(1, sum(study.control.links)))
 
     return run
 

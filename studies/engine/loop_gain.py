@@ -100,17 +100,14 @@ def _command_gains(
 
 def loop_gains(response: SampledLoopResponse) -> LoopGains:
     """Loop gains by frequency responses, leaves (n, ...), NumPy in float64."""
-    acting = np.flatnonzero(acting_commands(response.controller).any(axis=0))
+    acting = np.flatnonzero(np.any(acting_commands(response.controller), axis=0))
     return LoopGains(response, np.arange(len(response.plant.period)), acting)
 
 
-def acting_commands(controller: Controller) -> np.ndarray:
-    """Which commands act, (n, l K)."""
-    return np.asarray(_acting(controller))
-
-
 @kept_jit(is_quick=True)
-def _acting(controller: Controller) -> Array:
+def acting_commands(controller: Controller) -> Array:
+    """Which commands act, (n, l K)."""
+
     def seen(one: Controller) -> Array:
         each = [controller_response(one, np.exp(1j * angle)) != 0 for angle in (0.3, 3.0)]
         return (each[0] | each[1]).any(axis=1)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any
 
 import jax
 import numpy as np
@@ -55,14 +54,14 @@ def _judge_blocks(
     structure: Structure, cases: Case, figures: LoopFigures, pool: ThreadPoolExecutor
 ) -> np.ndarray:
     """Write the figures of all cases; returns which of them are known."""
-    count = _count(cases)
+    count, canonical = _count(cases), jax.dtypes.canonicalize_dtype
     size, most = GROUP, structure.n_links
     if count > FEW:  # idle links cost nothing; one number, since each has its own programs
         size, most = BLOCK, max(1, int(np.sum(cases.control.link_mask > 0, axis=1).max()))
     blocks = [np.minimum(np.arange(k, k + size), count - 1) for k in range(0, count, size)]
 
     def block(rows: np.ndarray) -> Case:
-        some: Case = jax.tree.map(lambda x: np.asarray(x[rows], _precision(x)), cases)
+        some: Case = jax.tree.map(lambda x: x[rows].astype(canonical(x.dtype)), cases)
         return some
 
     with on_host():
@@ -78,10 +77,6 @@ def _judge_blocks(
         if name != "is_known":
             getattr(figures, name)[:] = value
     return whole.is_known
-
-
-def _precision(x: Any) -> Any:
-    return jax.dtypes.canonicalize_dtype(x.dtype)
 
 
 def _judged(structure: Structure, n_active: int, steps: Steps, cases: Case) -> LoopVerdicts:

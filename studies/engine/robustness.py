@@ -144,7 +144,7 @@ def find_margins(
     # loops near the edge need more than single precision
     response, modes = jax.tree.map(lambda x: np.asarray(x, float), (response, modes))
     is_finite = _are_finite((response, modes))
-    acting, count = acting_commands(response.controller), len(is_finite)
+    acting, count = np.asarray(acting_commands(response.controller)), len(is_finite)
     found = {
         name: MarginPlace(np.full(count, np.nan), np.ones(count), np.ones(count)) for name in names
     }

@@ -47,10 +47,27 @@ def kernel_steps(
         calls: where every call of a kernel is noted.
         step, constants, inputs, state, n_steps: as there.
     """
+    call = _call_of(step, constants, inputs, state, n_steps)
+    calls.append(call)
+    leaves, tree = jax.tree.flatten(state)
+    lanes = leaves[0].shape[-1]
+
+    def filled(x: Any) -> Any:
+        x, more = jnp.asarray(x, call.dtype), call.lanes - lanes
+        width = [(0, 0)] * (x.ndim - 1) + [(0, more)]
+        return jnp.pad(x, width, mode="edge") if more else x
+
+    rows = [filled(x) if x.ndim > 1 else x for x in jax.tree.leaves(inputs)]
+    arrays = [*map(filled, jax.tree.leaves(constants)), *rows, *map(filled, leaves)]
+    return jax.tree.unflatten(tree, [x[..., :lanes] for x in call(arrays)])
+
+
+def _call_of(
+    step: Callable[..., Any], constants: Any, inputs: Any, state: Any, n_steps: int
+) -> bridge.CpuCall:
     parts = [jax.tree.flatten(part) for part in (constants, inputs, state)]
-    (given, _), (rows, _), (first, tree) = parts
+    (given, _), (rows, _), (first, _) = parts
     dtype, lanes = jax.dtypes.canonicalize_dtype(np.float64), first[0].shape[-1]
-    more = -lanes % lane_unit()
     varies = tuple(x.ndim > 1 for x in rows)
     trees = tuple(part[1] for part in parts)
     shapes = tuple(tuple(x.shape[:-1] for x in part) for part in (given, first))
@@ -64,11 +81,7 @@ def kernel_steps(
         # functions called more than once compile in a third of the time
         return outside(trace_loop, flat, constant, row, own, dtype, 0, True)
 
-    def filled(x: Any, is_wide: bool = True) -> Any:
-        width = [(0, 0)] * (x.ndim - 1) + [(0, more)]
-        return jnp.pad(jnp.asarray(x, dtype), width, mode="edge") if is_wide and more else x
-
-    call = bridge.CpuCall(
+    return bridge.CpuCall(
         name=f"{step.__name__} {dtype} {trees[0]} {shapes} {varies}",
         make=make,
         n_given=len(given) + len(rows),
@@ -76,11 +89,8 @@ def kernel_steps(
         records=(),
         dtype=dtype,
         n_steps=n_steps,
-        lanes=lanes + more,
+        lanes=lanes + -lanes % lane_unit(),
     )
-    calls.append(call)
-    arrays = [*map(filled, given), *map(filled, rows, varies), *map(filled, first)]
-    return jax.tree.unflatten(tree, [x[..., :lanes] for x in call(arrays)])
 
 
 def program_of_steps(
@@ -115,8 +125,14 @@ def _program_of_steps(
     names, module = [function.__qualname__, *names], function.__module__
 
     def trace() -> list[bridge.CpuCall]:
+        """The calls of kernels, of which none is made."""
         calls: list[bridge.CpuCall] = []
-        jax.eval_shape(partial(function, *names[1:], partial(kernel_steps, calls)), example)
+
+        def noted(*given: Any) -> Any:
+            calls.append(_call_of(*given))
+            return given[3]
+
+        jax.eval_shape(partial(function, *names[1:], noted), example)
         return calls
 
     def facts() -> list[bridge.CpuCall]:

@@ -222,3 +222,22 @@ def test_steps_over_lanes_without_a_kernel(monkeypatch):
     steps._PROGRAMS.clear()
     np.testing.assert_allclose(found, wanted, rtol=1e-15)
     np.testing.assert_allclose(found[0], 0.5**3 * 0 + 1.1 * (1 + 0.5 + 0.25), rtol=1e-15)
+
+
+def test_kernels_that_were_thrown_away_are_made_again(monkeypatch):
+    """A program is kept, and which kernels it needs, but not these."""
+    given, made, original = np.linspace(0.1, 1, 5), [], bridge.kept_kernel
+
+    def traced_again(name, make):
+        made.append(make())
+        return original(name, make)
+
+    monkeypatch.setattr(bridge, "kept_kernel", traced_again)
+    monkeypatch.setattr(steps, "is_keeping", lambda: True)
+    monkeypatch.setattr(steps, "kept_data", lambda names, make, module: make())
+    for kept in (steps._PROGRAMS, bridge._HANDLERS, bridge._KERNELS):
+        kept.clear()
+    found = steps.program_of_steps(stepped, [], given)(given)
+    steps._PROGRAMS.clear()
+    np.testing.assert_allclose(found, 1.75 * (1 + given) + np.arange(5.0) / 8, rtol=1e-14)
+    assert len(made) == 1
