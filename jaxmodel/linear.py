@@ -250,7 +250,9 @@ def natural_modes(plant: LinearPlant) -> NaturalModes:
         # motion of the pose without any spring is a zero eigenvalue with rounding on top
         omega = np.sqrt(np.maximum(-value.real, 0.0))
         order = np.argsort(omega)
-        return NaturalModes(omega[order] / (2 * np.pi), np.zeros(m), _scaled(vector.real[:, order]))
+        # of a pair of equal modes that rounding has split off the axis, both parts are modes
+        shape = np.where(np.imag(value) < 0, vector.imag, vector.real)[:, order]
+        return NaturalModes(omega[order] / (2 * np.pi), np.zeros(m), _scaled(shape))
     value, vector = np.linalg.eig(a)
     # a pair that rounding has split off the real axis by less than this is real
     is_real = np.abs(value.imag) <= 1e-9 * np.abs(value).max()

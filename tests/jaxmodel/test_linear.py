@@ -79,6 +79,16 @@ def test_pinned_free_modes_converge_slowly_to_the_same_frequencies():
     np.testing.assert_allclose(modes.frequency[[3, 6]], [114.9, 462.8], atol=0.05)
 
 
+def test_equal_modes_that_rounding_splits_are_two():
+    """A double eigenvalue may come out as a complex pair, whose real parts are one shape."""
+    block, one = np.array([[-2.0, 1e-15], [-1e-15, -2.0]]), np.eye(2)
+    state, order = np.zeros((4, 4)), [0, 2, 1, 3]  # from (X, q, X', q') to (X, X', q, q')
+    state[np.ix_(order, order)] = np.block([[0 * one, one], [block, 0 * one]])
+    modes = natural_modes(linear(UNDAMPED)._replace(state=state, force=np.zeros((4, 1))))
+    np.testing.assert_allclose(modes.frequency, np.sqrt(2) / (2 * np.pi), rtol=1e-12)
+    assert abs(np.linalg.det(modes.shape)) > 0.5
+
+
 def test_first_frequencies_are_the_same_for_the_other_assembly():
     changes = {"machine__assembly": "outward", "drive__kp": 0.0}
     modes = natural_modes(linear(UNDAMPED.change(**changes)))
