@@ -516,19 +516,22 @@ def command_gain(
     """
     plant = response.plant
     late = plant.late if delay is None else plant.late + delay
-    turned, order = _turns(plant, omega, late, is_exact)
-    sensed = jnp.einsum("n,nab->ab", turned, plant_images(plant, omega, order).sensed)
+    images = plant_images(plant, omega, _orders(is_exact))
+    sensed = jnp.einsum("n,nab->ab", _turns(plant, omega, late, is_exact), images.sensed)
     return -controller_response(response.controller, jnp.exp(1j * omega * plant.period)) @ sensed
 
 
-def _turns(
-    plant: PlantResponse, omega: Array, delay: Array, is_exact: bool
-) -> tuple[Array, np.ndarray]:
-    """Weights of images behind a delay [samples], and their numbers, (I,) each."""
+def _orders(is_exact: bool) -> np.ndarray:
+    """Numbers of the images that are evaluated, (I,)."""
     most = IMAGES if is_exact else FEW
-    order = np.arange(-most, most + 1)
+    return np.arange(-most, most + 1)
+
+
+def _turns(plant: PlantResponse, omega: Array, delay: Array, is_exact: bool) -> Array:
+    """Weights of these images behind a delay [samples], (I,)."""
+    order = _orders(is_exact)
     turned = image_weights(delay) if is_exact else jnp.exp(-2j * np.pi * delay * order)
-    return turned * jnp.exp(-1j * omega * plant.period * delay), order
+    return turned * jnp.exp(-1j * omega * plant.period * delay)
 
 
 class ClosedLoop(NamedTuple):
@@ -550,12 +553,11 @@ def close_loop(response: SampledLoopResponse, omega: Array, is_exact: bool = Tru
         is_exact: all images; otherwise `FEW`, for searches.
     """
     plant = response.plant
-    order = _turns(plant, omega, plant.late, is_exact)[1]
-    images = plant_images(plant, omega, order)
+    images = plant_images(plant, omega, _orders(is_exact))
     z = jnp.exp(1j * omega * plant.period)
 
     def sampled(parts: Array, delay: Array) -> Array:
-        return jnp.einsum("n,nab->ab", _turns(plant, omega, delay, is_exact)[0], parts)
+        return jnp.einsum("n,nab->ab", _turns(plant, omega, delay, is_exact), parts)
 
     now, late = jnp.zeros(()), plant.late
     gain = controller_response(response.controller, z)

@@ -274,7 +274,7 @@ def _from_many(
     return shaped
 
 
-def _from_one(response: LoopResponse, known: Crossing, start_at: float, steps: Steps) -> Crossing:
+def _from_one(response: LoopResponse, known: Crossing, start_at: Array, steps: Steps) -> Crossing:
     """Newton's iteration slightly to the right of a point known, which is divided out."""
 
     def work(at: Array) -> Crossing:

@@ -1,7 +1,7 @@
 """Stability of sampled loops: gain margin, what breaks beyond it, damping by mode.
 
 A pure function of cases, batched, on any device: frequency responses, elementwise steps over lanes
-and small eigenvalue problems. Where it cannot tell, it says so; `studies.engine.judge` then takes
+and small eigenvalue problems. Where it cannot tell, it says so; `studies.engine.margins` then takes
 eigenvalues of the whole loop.
 """
 

@@ -122,7 +122,6 @@ def _program_of_steps(
     """
     if not has_kernels():
         return _compiled(function, names, example, scan_steps)
-    names, module = [function.__qualname__, *names], function.__module__
 
     def trace() -> list[bridge.CpuCall]:
         """The calls of kernels, of which none is made."""
@@ -132,7 +131,7 @@ def _program_of_steps(
             calls.append(_call_of(*given))
             return given[3]
 
-        jax.eval_shape(partial(function, *names[1:], noted), example)
+        jax.eval_shape(partial(function, *names, noted), example)
         return calls
 
     def facts() -> list[bridge.CpuCall]:
@@ -144,14 +143,15 @@ def _program_of_steps(
     calls: list[bridge.CpuCall] = []
     try:
         if is_keeping():  # a program from disk is not traced, so nothing else makes its kernels
-            known = ["kernels of", *names, str(jax.tree.map(jnp.shape, example))]
-            for call in kept_data(known, facts, module):
+            shapes = str(jax.tree.map(jnp.shape, example))
+            known = ["kernels of", function.__qualname__, *names, shapes]
+            for call in kept_data(known, facts, function.__module__):
                 calls.append(replace(call, make=partial(made, call.name)))
                 calls[-1].kernel()
-        run = _compiled(function, names[1:], example, partial(kernel_steps, calls))
+        run = _compiled(function, names, example, partial(kernel_steps, calls))
     except NoKernelError as error:
         warn_of_scan(error)
-        return _compiled(function, names[1:], example, scan_steps)
+        return _compiled(function, names, example, scan_steps)
     kernels = {call.target: call.kernel() for call in calls}
 
     def timed(given: Any) -> Any:
