@@ -41,6 +41,8 @@ _MAKING: defaultdict[str, RLock] = defaultdict(RLock)
 #: Compiled programs hold some memory mappings each, and LLVM ends a process that wants more than
 #: the 65,530 of Linux. Programs of a sweep or tuning take up to 10,000.
 MOST_MAPPINGS = 20_000
+#: Mappings that stayed when programs were last dropped: of those in use.
+_STAYED = [0]
 #: Compiled programs of this process, by name.
 _PROGRAMS: dict[str, Any] = {}
 
@@ -176,11 +178,15 @@ def program(names: list[Any], arguments: list[Any], lower: Callable[[], Any], mo
 
 
 def drop_programs() -> None:
-    """Forget compiled programs before they become too many; those in use stay."""
-    if _mappings() > MOST_MAPPINGS:
+    """Forget compiled programs before they become too many; those in use stay.
+
+    What stays counts once more, or a process with many in use would make its programs at each call.
+    """
+    if _mappings() > MOST_MAPPINGS + _STAYED[0]:
         _PROGRAMS.clear()
         jax.clear_caches()
         gc.collect()
+        _STAYED[0] = min(_mappings(), MOST_MAPPINGS)
 
 
 def _mappings() -> int:

@@ -69,10 +69,24 @@ def test_too_many_programs_are_dropped(keeping, monkeypatch):
     programs.drop_programs()
     assert programs._PROGRAMS
     monkeypatch.setattr(programs, "MOST_MAPPINGS", 0)
+    monkeypatch.setattr(programs, "_STAYED", [0])
     programs.drop_programs()
     assert not programs._PROGRAMS
     for again in (in_use(*arguments[1:]), scaled(*arguments)):
         jax.tree.map(np.testing.assert_array_equal, first, again)
+
+
+def test_programs_in_use_do_not_make_all_others_go_at_each_call(keeping, monkeypatch):
+    cleared = []
+    monkeypatch.setattr(programs, "_STAYED", [0])
+    monkeypatch.setattr(programs, "_mappings", lambda: programs.MOST_MAPPINGS + 5)
+    monkeypatch.setattr(programs.jax, "clear_caches", lambda: cleared.append(1))
+    for _ in range(3):
+        programs.drop_programs()
+    assert cleared == [1]
+    monkeypatch.setattr(programs, "_mappings", lambda: 2 * programs.MOST_MAPPINGS + 1)
+    programs.drop_programs()
+    assert cleared == [1, 1]
 
 
 @pytest.mark.parametrize(
