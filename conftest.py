@@ -57,9 +57,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
-    """Drop compiled programs between files before they become too many."""
+    """Drop compiled programs between files, before they become too many within one."""
     if nextitem is not None and nextitem.fspath != item.fspath:
-        drop_programs()
+        drop_programs(0.5)
 
 
 # --- programs that are kept, and those that must not be ------------------------------------------

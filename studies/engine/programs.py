@@ -177,12 +177,15 @@ def program(names: list[Any], arguments: list[Any], lower: Callable[[], Any], mo
         return found
 
 
-def drop_programs() -> None:
+def drop_programs(share: float = 1.0) -> None:
     """Forget compiled programs before they become too many; those in use stay.
 
     What stays counts once more, or a process with many in use would make its programs at each call.
+
+    Args:
+        share: of the most that may be, from which on they go [1].
     """
-    if _mappings() > MOST_MAPPINGS + _STAYED[0]:
+    if _mappings() > share * MOST_MAPPINGS + _STAYED[0]:
         _PROGRAMS.clear()
         jax.clear_caches()
         gc.collect()
