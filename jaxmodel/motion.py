@@ -14,6 +14,9 @@ from jaxmodel.table import Table
 class Path(NamedTuple):
     """Straight moves between waypoints, each from rest to rest, with a pause after each.
 
+    Without moves, n = 0, the platform rests; what depends on its command alone is then computed
+    once for all cases of a batch.
+
     waypoints: poses (x, y, phi) [m, m, rad], shape (n + 1, 3).
     move_time: duration of each move, positive [s], shape (n,).
     dwell: pause after each move, the last one included [s], shape (n,).
@@ -45,6 +48,8 @@ def move_starts(path: Path) -> Array:
 
 def end_of_path(path: Path) -> Array:
     """Return the end of the last move [s], shape (); the last dwell does not count."""
+    if not len(path.move_time):
+        return jnp.zeros_like(path.waypoints[0, 0])
     return move_starts(path)[-1] + path.move_time[-1]
 
 
@@ -91,6 +96,8 @@ def sample_path(path: Path, time: Array) -> PathSample:
         PathSample with arrays of shape (..., 3).
     """
     path = jax.tree.map(jnp.asarray, path)
+    if not len(path.move_time):
+        return _resting(path, jnp.shape(time))
     starts = move_starts(path)
     steps = jnp.diff(path.waypoints, axis=0)
     last = len(path.move_time) - 1
@@ -110,6 +117,11 @@ def sample_path(path: Path, time: Array) -> PathSample:
         )
 
     return PathSample(*jnp.vectorize(at, signature="()->(d),(d),(d)")(time))
+
+
+def _resting(path: Path, shape: tuple[int, ...]) -> PathSample:
+    pose = jnp.broadcast_to(path.waypoints[0], (*shape, path.waypoints.shape[-1]))
+    return PathSample(pose, jnp.zeros_like(pose), jnp.zeros_like(pose))
 
 
 def shape_path(
@@ -137,6 +149,8 @@ def shape_path(
     Returns:
         PathSample with arrays of shape (n_times, 3).
     """
+    if not len(path.move_time):
+        return _resting(path, (n_times,))
     time = step * jnp.arange(n_times)
     if within is not None:
         sample, point = np.divmod(np.arange(n_times), per_sample)

@@ -272,7 +272,7 @@ def _damping(numbers: Numbers, xp: Any) -> Damping:
 def _path(numbers: Numbers, xp: Any) -> motion.Path:
     points = numbers["motion.waypoints"]  # (..., M, p), NaN beyond the last one
     count = xp.sum(~xp.isnan(points[..., 0]), axis=-1)
-    moves = max(points.shape[-2] - 1, 1)  # a platform at rest moves to its own pose
+    moves = points.shape[-2] - 1
     reached = xp.minimum(xp.arange(moves + 1), count[..., None] - 1)
     points = xp.take_along_axis(points, reached[..., None], axis=-2)
     is_move = xp.arange(moves) < count[..., None] - 1

@@ -235,6 +235,23 @@ def test_shaped_paths_in_a_batch_and_their_gradients():
     check_grads(velocity, (700.0,), order=1, modes=["fwd", "rev"], eps=1e-3, rtol=1e-6)
 
 
+def test_a_path_without_moves_rests_at_its_pose():
+    """As one whose only move leads to its own pose."""
+    pose = np.array([[0.01, -0.02, 0.5]])
+    profile = np.asarray(PROFILES.position("cycloid"))
+    still = Path(pose, np.zeros(0), np.zeros(0), profile)
+    moving = Path(np.repeat(pose, 2, axis=0), np.array([1e-12]), np.zeros(1), profile)
+    taps = Taps(np.array([0.3, 0.7]), np.array([0, 2]))
+    times = np.linspace(-0.1, 0.2, 4)
+    for found, wanted in (
+        (sample(still, times), sample(moving, times)),
+        (shape(still, taps, 7, 2, 1e-4), shape(moving, taps, 7, 2, 1e-4)),
+    ):
+        for a, b in zip(found, wanted, strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-15)
+    assert float(end_of_path(still)) == 0
+
+
 def test_points_within_samples_may_be_anywhere():
     """Those before and after a command changes, the same in every sample."""
     path, period = quick_path(), 4 * STEP

@@ -10,9 +10,10 @@ import pytest
 from jaxmodel import status
 from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import simulate
-from studies.engine.executor import Differentiated
+from studies.engine.executor import Differentiated, Executor
+from studies.engine.plan import Layout
 from studies.engine.runs import _simulate
-from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.cases import as_arrays, build_case, build_cases, build_structure
 from tests.bare import paper_study
 
 N_CASES = 16
@@ -58,6 +59,20 @@ def mixed_case(rng):
             control=case.control._replace(n_active=float(rng.integers(1, 4))),
         )
     )
+
+
+@pytest.mark.parametrize(("points", "is_shared"), [(1, True), (2, False)])
+def test_the_command_of_a_platform_at_rest_is_computed_once(points, is_shared):
+    """Also where each case has a shaper of its own."""
+    points = paper_study().motion.waypoints[:points]
+    study = short_study(motion__waypoints=points, shaper__kind="ei")
+    structure = build_structure(study)
+    cases = build_cases(study, {"shaper.damping_ratio": np.array([0.01, 0.02])}, structure)
+    executor = Executor(structure, Layout(devices=1, blocks=1, lanes=2), kind="scan")
+    function, _ = executor._prepare(cases, ())
+    varies = jax.tree.unflatten(function.parts.tree, function.parts.is_varying).inputs
+    assert varies.window.after_command
+    assert {varies.rho, varies.rho_rate, varies.pose} == {not is_shared}
 
 
 def test_gradients_of_several_numbers_are_those_of_their_own_metrics():
