@@ -10,6 +10,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from importlib.util import find_spec
 from ipaddress import ip_address
 from multiprocessing import current_process, resource_tracker
 from pathlib import Path
@@ -80,14 +81,16 @@ class Workers(NamedTuple):
         """Whether workers are requested; otherwise this process does the work."""
         return self.scheduler is not None or self.local is not None
 
-    def advise(self, is_large: bool, say: Callable[[str], None]) -> None:
-        """Say it if much work, worth the 10 s of their start, would end sooner on local workers."""
+    def with_default(self, is_large: bool, say: Callable[[str], None]) -> Workers:
+        """These; where none are named, for much work, worth the 10 s of their start, all cores."""
         cores = usable_cores()
-        if not self.are_named and cores >= MANY and is_large and processor() == "cpu":
-            say(
-                f"one process uses about four of {cores} cores; --local-workers {cores // 2} "
-                "is faster (2 to 4 times on 16 cores)"
-            )
+        if self.are_named or cores < MANY or not is_large or processor() != "cpu":
+            return self
+        if find_spec("distributed") is None:
+            say(f"one process uses about four of {cores} cores; flexlink-studies[cluster] uses all")
+            return self
+        say(f"{cores // 2} processes share {cores} cores; --local-workers 1: one uses about four")
+        return self._replace(local=cores // 2)
 
 
 def runner_for(

@@ -101,7 +101,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             return ClusterScreener(client, worker_timeout)
 
         with resumable(out, again), Phases(console, PHASES, quiet) as phases:
-            workers.advise(asked.n_designs >= LARGE, phases.say)
+            workers = workers.with_default(asked.n_designs >= LARGE, phases.say)
             with on_workers(workers, phases.say, make) as screener:
                 done = run_screen(asked, out, screener=screener, phases=phases)
             if not done.is_interrupted:

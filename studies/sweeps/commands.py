@@ -116,7 +116,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         names = (*sweep_phases(sweep_spec), *(["report"] if report else []))
         with Phases(console, names, quiet) as phases:
             design = design_of(sweep_spec.root, sweep_spec.study, sweep_spec.sweep.seed)
-            workers.advise(design.size * sweep_spec.sweep.repeats >= LARGE, phases.say)
+            is_large = design.size * sweep_spec.sweep.repeats >= LARGE
+            workers = workers.with_default(is_large, phases.say)
             with runner_for(sweep_spec, workers, phases.say) as runner:
                 done = run_sweep(sweep_spec, out, resume, runner=runner, phases=phases)
             if report and not done.is_interrupted:

@@ -275,19 +275,18 @@ def test_bad_options_are_refused(capsys, tmp_path, cluster, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("cores", "is_large", "local", "is_said"),
-    [
-        (16, True, None, True),
-        (16, False, None, False),
-        (4, True, None, False),
-        (16, True, 8, False),
-    ],
+    ("cores", "is_large", "local", "used"),
+    [(16, True, None, 8), (16, False, None, None), (4, True, None, None), (16, True, 3, 3)],
 )
-def test_many_cores_are_told_of_workers(monkeypatch, cores, is_large, local, is_said):
+def test_much_work_uses_many_cores_without_being_asked(monkeypatch, cores, is_large, local, used):
     monkeypatch.setattr(connect, "usable_cores", lambda: cores)
-    lines = []
-    Workers(scheduler=None, local=local, timeout=600.0).advise(is_large, lines.append)
-    assert len(lines) == is_said and all("--local-workers 8" in line for line in lines)
+    lines, named = [], Workers(scheduler=None, local=local, timeout=600.0)
+    assert named.with_default(is_large, lines.append).local == used
+    assert len(lines) == (local is None and used is not None)
+    assert all(line.startswith("8 processes share 16 cores") for line in lines)
+    monkeypatch.setattr(connect, "find_spec", lambda name: None)
+    assert named.with_default(is_large, lines.append) == named
+    assert all("[cluster]" in line for line in lines[1:])
 
 
 @pytest.mark.parametrize(
