@@ -23,7 +23,7 @@ from jaxmodel.return_difference import (
     characteristic_polynomial,
     evaluate_loop_gain,
 )
-from jaxmodel.steps import GROUP, Steps, in_groups, lanes_of
+from jaxmodel.steps import Steps, in_groups, lanes_of
 
 #: Iterations to find the poles without control; twice as many more for those not `SETTLED`.
 SETTLING = 12
@@ -97,7 +97,7 @@ def _poles(response: LoopResponse, modes: AssembledModes, order: Array, steps: S
         return _follow(lanes_of(response, at), lanes_of(own, at), WAYS[1], steps)
 
     is_lost = jnp.isnan(found.re[0]) & ~jnp.isnan(own.re[0])
-    return in_groups(again, is_lost, GROUP, found)
+    return in_groups(again, is_lost, found)
 
 
 def _open_loop_poles(
@@ -118,7 +118,7 @@ def _open_loop_poles(
         mine, apart, start = lanes_of((response, held, own), at)
         return _settle(mine, apart, start, 2 * SETTLING, steps)
 
-    own = in_groups(further, jnp.any(own.step > SETTLED, axis=0), GROUP, own)
+    own = in_groups(further, jnp.any(own.step > SETTLED, axis=0), own)
     is_there = jnp.all(own.step <= SETTLED, axis=0) & (jnp.min(share, axis=0) > CLEAR)
     return Pair(jnp.where(is_there, own.pole.re, jnp.nan), own.pole.im)
 

@@ -34,7 +34,7 @@ from jaxmodel.return_difference import (
     characteristic_polynomial,
 )
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
-from jaxmodel.steps import GROUP, Steps, in_groups, lanes_of
+from jaxmodel.steps import Steps, in_groups, lanes_of
 
 
 class FrequencySweep(NamedTuple):
@@ -105,7 +105,7 @@ def gain_margins(
     def again(at: Array) -> tuple[Crossing, Array, Array]:
         return _search(lanes_of(given, at), SWEEPS[1], steps)
 
-    crossing, is_doubtful, is_lost = in_groups(again, found[1], GROUP, found)
+    crossing, is_doubtful, is_lost = in_groups(again, found[1], found)
     at_end, where = _end_eigenvalues(response, least, steps)
     is_static = at_end > crossing.value
     value = jnp.where(is_static, at_end, crossing.value)
@@ -269,7 +269,7 @@ def _from_many(
         value, omega = lanes_of(start, at)
         return _converged(lanes_of(response, lane[at]), value, omega, _nowhere(value), steps)
 
-    found = in_groups(work, flat, GROUP, _nowhere(start[0]))
+    found = in_groups(work, flat, _nowhere(start[0]))
     shaped: Crossing = jax.tree.map(lambda x: x.reshape(value.shape), found)
     return shaped
 
@@ -281,7 +281,7 @@ def _from_one(response: LoopResponse, known: Crossing, start_at: Array, steps: S
         mine, own = lanes_of((response, known), at)
         return _converged(mine, own.value * start_at, own.omega, own, steps)
 
-    return in_groups(work, known.value > 0, GROUP, _nowhere(known.value))
+    return in_groups(work, known.value > 0, _nowhere(known.value))
 
 
 def _nowhere(like: Array) -> Crossing:

@@ -41,8 +41,9 @@ def scan_steps(step: Callable[..., _S], constants: Any, inputs: Any, state: _S, 
     return jax.lax.scan(body, state, inputs, length=n_steps)[0]
 
 
-#: Lanes of a group.
-GROUP = 8
+#: Lanes of a group at least, and groups of all lanes at most: a device with many threads wants
+#: large ones.
+GROUP, GROUPS = 8, 64
 
 
 def lanes_of(tree: Any, at: Array) -> Any:
@@ -50,16 +51,15 @@ def lanes_of(tree: Any, at: Array) -> Any:
     return jax.tree.map(lambda x: jnp.take(x, at, axis=-1, mode="clip"), tree)
 
 
-def in_groups(work: Callable[[Array], _S], chosen: Array, size: int, like: _S) -> _S:
+def in_groups(work: Callable[[Array], _S], chosen: Array, like: _S) -> _S:
     """Results of those lanes only that are chosen, group by group.
 
     Args:
-        work: maps numbers of lanes (size,) to their results, lanes last.
+        work: maps numbers of lanes, those of a group, to their results, lanes last.
         chosen: which lanes, (n,).
-        size: of a group.
         like: results of all lanes, which the others keep, (..., n).
     """
-    count = jnp.sum(chosen)
+    count, size = jnp.sum(chosen), max(GROUP, len(chosen) // GROUPS)
     order = jnp.argsort(~chosen, stable=True)
     order = jnp.concatenate([order, jnp.repeat(order[-1:], size)])
 

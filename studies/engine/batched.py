@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import jax
@@ -19,11 +19,10 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.judge import LoopVerdicts, can_judge, judge
 from jaxmodel.parameters import Array
 from jaxmodel.simulate import Result
-from jaxmodel.steps import scan_steps
 from studies.engine.function import BlockFunction, fastest_function
 from studies.engine.plan import STATIC, lane_unit, padded_rows
 from studies.engine.preflight import check_run
-from studies.engine.steps import has_kernels, kernel_steps
+from studies.engine.steps import fastest_steps
 from studies.errors import StudyError
 from studies.kernels.differentiable import outside
 from studies.study.cases import case_of, with_used
@@ -93,10 +92,10 @@ def _judge_program(
         raise StudyError(
             f"is_judged: of control.feedback = {study.control.feedback!r}, control.law = "
             f"{study.control.law!r} and drive.kind = {study.drive.kind!r}, with drive.lag = "
-            f"{study.drive.lag:g} s, only eigenvalues judge a loop: see loop_report"
+            f"{study.drive.lag:g} s, only eigenvalues judge a loop: run_study(study).loop has them"
         )
     shared, build = one_study(study, structure), _Build(structure, positions)
-    steps = partial(kernel_steps, []) if has_kernels() else scan_steps
+    steps = fastest_steps([])
 
     def run(parameters: Array) -> LoopVerdicts:
         cases = jax.vmap(lambda free: build(free, None, shared))(parameters)

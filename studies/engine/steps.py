@@ -13,13 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodel.steps import scan_steps
-from studies.config import is_keeping
+from jaxmodel.steps import Steps, scan_steps
+from studies.config import device_now, is_keeping, processor
 from studies.engine.plan import lane_unit
 from studies.engine.programs import kept_data, program, quick_options
 from studies.errors import NoKernelError, warn_of_scan
-from studies.kernels import bridge, llvm
-from studies.kernels.differentiable import outside
+from studies.kernels import bridge, gpu, llvm
+from studies.kernels.differentiable import LoopCall, outside
 from studies.kernels.traced import InputLeaf, trace_loop
 
 #: Programs kept in memory; one thread makes them.
@@ -28,13 +28,20 @@ _PROGRAMS: dict[str, Callable[[Any], Any]] = {}
 _MAKING = Lock()
 
 
-def has_kernels() -> bool:
-    """Whether this machine's cores can run steps as kernels."""
-    return llvm.is_available() and bridge.is_available()
+def fastest_steps(calls: list[LoopCall]) -> Steps:
+    """Steps as kernels of the device that programs are compiled for, a scan where it has none.
+
+    Args:
+        calls: where every call of a kernel is noted.
+    """
+    kind: type[LoopCall] = bridge.CpuCall if device_now().platform == "cpu" else gpu.GpuCall
+    is_known = bridge.is_available() if kind is bridge.CpuCall else processor() == "cuda"
+    return partial(kernel_steps, kind, calls) if llvm.is_available() and is_known else scan_steps
 
 
 def kernel_steps(
-    calls: list[bridge.CpuCall],
+    kind: type[LoopCall],
+    calls: list[LoopCall],
     step: Callable[..., Any],
     constants: Any,
     inputs: Any,
@@ -44,10 +51,11 @@ def kernel_steps(
     """See `jaxmodel.steps.Steps`.
 
     Args:
-        calls: where every call of a kernel is noted.
+        kind: of calls, for cores or a GPU.
+        calls: where every one is noted.
         step, constants, inputs, state, n_steps: as there.
     """
-    call = _call_of(step, constants, inputs, state, n_steps)
+    call = _call_of(kind, step, constants, inputs, state, n_steps)
     calls.append(call)
     leaves, tree = jax.tree.flatten(state)
     lanes = leaves[0].shape[-1]
@@ -63,8 +71,13 @@ def kernel_steps(
 
 
 def _call_of(
-    step: Callable[..., Any], constants: Any, inputs: Any, state: Any, n_steps: int
-) -> bridge.CpuCall:
+    kind: type[LoopCall],
+    step: Callable[..., Any],
+    constants: Any,
+    inputs: Any,
+    state: Any,
+    n_steps: int,
+) -> LoopCall:
     parts = [jax.tree.flatten(part) for part in (constants, inputs, state)]
     (given, _), (rows, _), (first, _) = parts
     dtype, lanes = jax.dtypes.canonicalize_dtype(np.float64), first[0].shape[-1]
@@ -78,10 +91,10 @@ def _call_of(
     def make() -> Any:
         constant, own = ([InputLeaf(shape, True) for shape in part] for part in shapes)
         row = [InputLeaf((), is_wide) for is_wide in varies]
-        # functions called more than once compile in a third of the time
-        return outside(trace_loop, flat, constant, row, own, dtype, 0, True)
+        # for cores functions called more than once compile in a third of the time
+        return outside(trace_loop, flat, constant, row, own, dtype, 0, kind is bridge.CpuCall)
 
-    return bridge.CpuCall(
+    return kind(
         name=f"{step.__name__} {dtype} {trees[0]} {shapes} {varies}",
         make=make,
         n_given=len(given) + len(rows),
@@ -98,7 +111,7 @@ def program_of_steps(
 ) -> Callable[[Any], Any]:
     """`_program_of_steps`, made once in this process."""
     shapes = jax.tree.map(jnp.shape, example)
-    key = repr((function.__qualname__, names, shapes, is_keeping()))
+    key = repr((function.__qualname__, names, shapes, is_keeping(), str(device_now())))
     with _MAKING:
         if key not in _PROGRAMS:
             while len(_PROGRAMS) >= KEPT:
@@ -120,27 +133,29 @@ def _program_of_steps(
     Returns:
         A function of the latter, whose results are there when it returns.
     """
-    if not has_kernels():
-        return _compiled(function, names, example, scan_steps)
+    calls: list[Any] = []
+    steps = fastest_steps(calls)
+    # a scan has no kernels, and those of a GPU are part of the program
+    if steps is scan_steps or device_now().platform != "cpu":
+        return _compiled(function, names, example, steps)
 
-    def trace() -> list[bridge.CpuCall]:
+    def trace() -> list[Any]:
         """The calls of kernels, of which none is made."""
-        calls: list[bridge.CpuCall] = []
+        found = []
 
         def noted(*given: Any) -> Any:
-            calls.append(_call_of(*given))
+            found.append(_call_of(bridge.CpuCall, *given))
             return given[3]
 
         jax.eval_shape(partial(function, *names, noted), example)
-        return calls
+        return found
 
-    def facts() -> list[bridge.CpuCall]:
+    def facts() -> list[Any]:
         return [replace(call, make=_nothing) for call in trace()]
 
     def made(name: str) -> Any:
         return next(call.make() for call in trace() if call.name == name)
 
-    calls: list[bridge.CpuCall] = []
     try:
         if is_keeping():  # a program from disk is not traced, so nothing else makes its kernels
             shapes = str(jax.tree.map(jnp.shape, example))
@@ -148,7 +163,7 @@ def _program_of_steps(
             for call in kept_data(known, facts, function.__module__):
                 calls.append(replace(call, make=partial(made, call.name)))
                 calls[-1].kernel()
-        run = _compiled(function, names, example, partial(kernel_steps, calls))
+        run = _compiled(function, names, example, steps)
     except NoKernelError as error:
         warn_of_scan(error)
         return _compiled(function, names, example, scan_steps)
@@ -171,7 +186,8 @@ def _nothing() -> Any:
 def _compiled(
     function: Callable[..., Any], names: list[Any], example: Any, steps: Any
 ) -> Callable[[Any], Any]:
-    options = None if steps is scan_steps else quick_options()
+    is_quick = steps is not scan_steps and device_now().platform == "cpu"
+    options = quick_options() if is_quick else None
 
     def lower() -> Any:
         whole = jax.jit(partial(function, *names, steps), compiler_options=options)

@@ -152,20 +152,23 @@ def test_curves_that_were_thrown_away_tell_nothing(judged):
 # --- lanes ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("chosen", [[], [4], [0, 3, 4, 5, 9], list(range(10))])
-def test_groups_of_lanes_change_those_that_are_chosen(chosen):
-    given, calls = np.arange(10.0), []
+@pytest.mark.parametrize(
+    ("count", "size"), [(20, 8), (64 * 9, 9)], ids=["a few lanes", "many lanes"]
+)
+@pytest.mark.parametrize("chosen", [[], [4], [0, 3, 4, 5, 9], list(range(20))])
+def test_groups_of_lanes_change_those_that_are_chosen(chosen, count, size):
+    given, calls = np.arange(count, dtype=float), []
 
     def work(at):
         calls.append(at.shape)
         return lanes_of({"a": given, "b": np.stack([given, -given])}, at)
 
-    mask = np.isin(np.arange(10), chosen)
-    like = {"a": np.full(10, 7.0), "b": np.full((2, 10), 8.0)}
-    found = jax.jit(lambda mask: in_groups(work, mask, 4, like))(mask)
+    mask = np.isin(np.arange(count), chosen)
+    like = {"a": np.full(count, 7.0), "b": np.full((2, count), 8.0)}
+    found = jax.jit(lambda mask: in_groups(work, mask, like))(mask)
     np.testing.assert_array_equal(found["a"], np.where(mask, given, 7.0))
     np.testing.assert_array_equal(found["b"], np.where(mask, [given, -given], 8.0))
-    assert set(calls) == {(4,)}
+    assert set(calls) == {(size,)}
 
 
 def test_steps_as_a_scan():

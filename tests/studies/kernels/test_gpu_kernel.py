@@ -8,18 +8,21 @@ import ctypes
 import re
 import shutil
 import subprocess
+from functools import partial
 
 import jax
 import numpy as np
 import pytest
 
 from jaxmodel import status
+from jaxmodel.judge import judge
 from studies import config
 from studies.bench.works import METRICS, WORKS
 from studies.engine import function
 from studies.engine.executor import Executor, executor_text
 from studies.engine.function import stepper
 from studies.engine.plan import Layout
+from studies.engine.steps import kernel_steps
 from studies.kernels import bridge, gpu, llvm, native
 from studies.kernels.differentiable import DifferentiableLoop
 from studies.kernels.traced import InputLeaf, trace_loop
@@ -114,6 +117,24 @@ def test_gradients_equal_those_of_the_traced_kernel(monkeypatch):
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11 * np.abs(b).max())
         assert np.abs(b).max() > 0
+
+
+@pytest.mark.long
+def test_loops_are_judged_as_on_cores(monkeypatch):
+    monkeypatch.setattr(gpu.GpuCall, "__call__", rehearsed)
+    study = paper_study().change(link__modes=2)
+    structure = build_structure(study)
+    gains = {"control.gain_factor": np.geomspace(0.1, 3.0, 5)}
+    cases = jax.tree.map(
+        lambda x: np.broadcast_to(x, (5, *x.shape[1:])), build_cases(study, gains, structure)
+    )
+    found, wanted = (
+        jax.jit(partial(judge, structure, steps=partial(kernel_steps, kind, [])))(cases)
+        for kind in (gpu.GpuCall, bridge.CpuCall)
+    )
+    for a, b in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9)
+    assert found.is_known.all() and np.ptp(found.gain_margin) > 0
 
 
 def test_without_the_call_target_the_scan_runs(monkeypatch):
