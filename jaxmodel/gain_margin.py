@@ -70,7 +70,7 @@ AGAIN = (1.02, 1.1, 1.005)
 #: A crossing seen on the sweep is in doubt if Newton's iteration ends farther from it than this
 #: factor; a curve close to the axis counts beyond the rightmost crossing by at least the second.
 NEAR, BEYOND = 1.2, 1.02
-#: Visits at an end of the axis.
+#: Visits at an end of the axis, and where a sweep begins.
 VISITS = 24
 
 
@@ -99,14 +99,14 @@ def gain_margins(
     moving = _with_gains(response, 1 / weaker)
     response, modes = jax.lax.stop_gradient((moving, modes))
     least = jnp.maximum(1 / (HIGHEST * weaker), SPREAD)
-    given = response, modes, each / weaker, least
+    at_end, where = _end_eigenvalues(response, least, steps)
+    given = response, modes, each / weaker, least, at_end
     found = _search(given, SWEEPS[0], steps)
 
     def again(at: Array) -> tuple[Crossing, Array, Array]:
         return _search(lanes_of(given, at), SWEEPS[1], steps)
 
     crossing, is_doubtful, is_lost = in_groups(again, found[1], found)
-    at_end, where = _end_eigenvalues(response, least, steps)
     is_static = at_end > crossing.value
     value = jnp.where(is_static, at_end, crossing.value)
     omega = jnp.where(is_static, where, crossing.omega)
@@ -170,17 +170,22 @@ def _moved_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
 
 
 def _search(
-    loops: tuple[LoopResponse, AssembledModes, Array, Array], sweep: FrequencySweep, steps: Steps
+    loops: tuple[LoopResponse, AssembledModes, Array, Array, Array],
+    sweep: FrequencySweep,
+    steps: Steps,
 ) -> tuple[Crossing, Array, Array]:
     """The rightmost crossings; whether more may have been there, and whether curves were lost.
 
     Args:
-        loops: responses, modes without control and their strength, and least value that counts.
+        loops: responses, modes without control and their strength, least value that counts, and
+            that at the ends of the axis.
         sweep: where to look.
         steps: runs elementwise steps.
     """
-    response, modes, strength, least = loops
-    loci = _follow_axis(response, modes, strength, sweep, steps)
+    response, modes, strength, least, at_end = loops
+    omega = sweep_frequencies(modes, strength, response.period, sweep)
+    begin = _eigenvalues_at(response, SPREAD, omega[0], steps)
+    loci = _visit(response, SPREAD, begin, omega, steps)
     size = jnp.hypot(loci.value.re, loci.value.im)
     is_lost = ~jnp.all(size < FARTHEST, axis=0)
     seen, place = _largest(loci.crossing, loci.place)
@@ -199,9 +204,10 @@ def _search(
     crossing = jax.tree.map(lambda x: jnp.take_along_axis(x, best[None], axis=0)[0], found)
     there = found.value[:count]
     is_near = (there < NEAR * seen) & (seen < NEAR * there)
-    is_strange = is_seen & ~is_near & (seen > crossing.value)
+    decides = jnp.maximum(crossing.value, at_end)
+    is_strange = is_seen & ~is_near & (seen > decides)
     left_out = jnp.sort(strength, axis=0)[::-1][sweep.modes :][:1]
-    is_doubtful = is_strange.any(axis=0) | (crossing.value < SAFE * left_out).any(axis=0)
+    is_doubtful = is_strange.any(axis=0) | (decides < SAFE * left_out).any(axis=0)
 
     def beside_it(crossing: Crossing, start_at: Array) -> tuple[Crossing, None]:
         other = _from_one(response, crossing, start_at, steps)
@@ -239,23 +245,18 @@ def fold_frequency(omega: Array, top: Array) -> Array:
     return jnp.abs((omega + top) % (2 * top) - top)
 
 
-def _follow_axis(
-    response: LoopResponse,
-    modes: AssembledModes,
-    strength: Array,
-    sweep: FrequencySweep,
-    steps: Steps,
-) -> Loci:
-    omega = sweep_frequencies(modes, strength, response.period, sweep)
-    spread = _spread(response, SPREAD)
-    first = -spread.reshape(-1, spread.shape[-1])
-    return _visit(response, spread, Pair(first, 0 * first), omega, steps)
-
-
-def _visit(response: LoopResponse, spread: Array, first: Pair, omega: Array, steps: Steps) -> Loci:
+def _visit(response: LoopResponse, spread: float, first: Pair, omega: Array, steps: Steps) -> Loci:
     angle = omega * response.period
     inputs = FrequencyPoint(omega, jnp.cos(angle), jnp.sin(angle))
-    return steps(follow_loci, (response, spread), inputs, start_loci(first), len(omega))
+    apart = _spread(response, spread)
+    return steps(follow_loci, (response, apart), inputs, start_loci(first), len(omega))
+
+
+def _eigenvalues_at(response: LoopResponse, spread: float, omega: Array, steps: Steps) -> Pair:
+    """Eigenvalues of L at a frequency of each loop [rad/s], (m, n)."""
+    count = np.prod(response.velocity_gain.shape[:2])
+    first = Pair(*(jnp.broadcast_to(x[:, None], (len(x), len(omega))) for x in _ring(count)))
+    return _visit(response, spread, first, jnp.tile(omega, (VISITS, 1)), steps).value
 
 
 def _from_many(
@@ -307,13 +308,10 @@ def _end_eigenvalues(response: LoopResponse, least: Array, steps: Steps) -> tupl
     L is real there, so its curves end on the real axis without crossing it: position feedback loses
     its static stiffness at 0, differences their sign at pi/T.
     """
-    spread, top = _spread(response, FINE_SPREAD), np.pi / response.period
-    ring = _ring(len(spread) * spread.shape[1])
-    first = Pair(*(jnp.broadcast_to(x[:, None], (len(x), len(top))) for x in ring))
+    top = np.pi / response.period
     value, omega = jnp.zeros_like(top), jnp.full_like(top, jnp.nan)
     for place, name in ((0 * top + STILL, 0 * top), (top * (1 - 1e-6), top)):
-        visits = jnp.tile(place, (VISITS, 1))
-        last = _visit(response, spread, first, visits, steps).value
+        last = _eigenvalues_at(response, FINE_SPREAD, place, steps)
         is_real = (last.re > least) & (jnp.abs(last.im) < 1e-3 * last.re)
         largest = jnp.max(jnp.where(is_real, last.re, 0.0), axis=0)
         omega = jnp.where(largest > value, name, omega)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxmodel.damping import least_controlled
-from jaxmodel.gain_margin import AGAIN, CHOSEN, CONVERGED, SWEEPS, VISITS, gain_margins
+from jaxmodel.gain_margin import AGAIN, CHOSEN, SWEEPS, VISITS, gain_margins
 from jaxmodel.judge import _respond
 from jaxmodel.loci import follow_loci
 from jaxmodel.loop_figures import HIGHEST
@@ -70,7 +70,7 @@ def judged(response):
                 end = known.get(round(row, 6), row)
                 is_it = jnp.abs(state.value - row) < 1e-9
                 value = jnp.where(is_it, abs(end), value)
-                step = jnp.where(is_it, CONVERGED * (0.9 if end > 0 else 1.1), step)
+                step = jnp.where(is_it, 1e-3 * (0.9 if end > 0 else 1.1), step)
             for loop, (start, end) in beside.items():
                 is_it = (loops == loop) & (jnp.abs(state.value - start) < 1e-9)
                 value, step = jnp.where(is_it, end, value), jnp.where(is_it, 0.0, step)
