@@ -59,7 +59,7 @@ SPREAD, FINE_SPREAD = 1e-3, 1e-6
 FARTHEST = 1e6
 #: Crossings examined per case, and as many points where a curve only comes close to the axis.
 CHOSEN = 4
-#: The sweep starts from small numbers, so stronger loops are examined with weaker gains [1].
+#: Guesses of the first eigenvalues are near 1: stronger loops are examined with weaker gains [1].
 STRONG = 30.0
 #: Modes left out may matter where the margin is not this many times stricter than theirs [1].
 SAFE = 3.0

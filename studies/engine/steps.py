@@ -111,7 +111,7 @@ def program_of_steps(
 ) -> Callable[[Any], Any]:
     """`_program_of_steps`, made once in this process."""
     shapes = jax.tree.map(jnp.shape, example)
-    key = repr((function.__qualname__, names, shapes, is_keeping(), str(device_now())))
+    key = repr((function.__qualname__, names, shapes, is_keeping()))
     with _MAKING:
         if key not in _PROGRAMS:
             while len(_PROGRAMS) >= KEPT:
@@ -123,7 +123,7 @@ def program_of_steps(
 def _program_of_steps(
     function: Callable[..., Any], names: list[Any], example: Any
 ) -> Callable[[Any], Any]:
-    """The program of `function(*names, steps, example)`, which runs its steps as kernels.
+    """The program of `function(*names, steps, example)`, whose kernels are those of the cores.
 
     Args:
         function: of a module; its last arguments are `steps` and what varies.
@@ -135,8 +135,7 @@ def _program_of_steps(
     """
     calls: list[Any] = []
     steps = fastest_steps(calls)
-    # a scan has no kernels, and those of a GPU are part of the program
-    if steps is scan_steps or device_now().platform != "cpu":
+    if steps is scan_steps:
         return _compiled(function, names, example, steps)
 
     def trace() -> list[Any]:
@@ -186,8 +185,7 @@ def _nothing() -> Any:
 def _compiled(
     function: Callable[..., Any], names: list[Any], example: Any, steps: Any
 ) -> Callable[[Any], Any]:
-    is_quick = steps is not scan_steps and device_now().platform == "cpu"
-    options = quick_options() if is_quick else None
+    options = None if steps is scan_steps else quick_options()
 
     def lower() -> Any:
         whole = jax.jit(partial(function, *names, steps), compiler_options=options)
