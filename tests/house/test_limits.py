@@ -55,12 +55,16 @@ def test_every_limit_has_a_cure(limits):
 
 # --- the budget of tests --------------------------------------------------------------------------
 
-ALLOWED = {"tests/a.py": Cost(10, 20.0), "tests/small.py": Cost(0, 1.0)}
+ALLOWED = {
+    "tests/a.py": Cost(10, 10.0),
+    "tests/small.py": Cost(0, 1.0),
+    "tests/c.py": Cost(9, 14.0),
+}
 
 
 def test_files_may_cost_what_the_table_allows():
     assert excesses(ALLOWED, ALLOWED, 1.0) == []
-    assert excesses({"tests/small.py": Cost(0, LEAST)}, ALLOWED, 1.0) == []
+    assert excesses({"tests/small.py": Cost(0, 2 * LEAST)}, ALLOWED, 1.0) == []
     assert excesses({"campaigns/test_long.py": Cost(900, 900.0)}, ALLOWED, 1.0) == []
 
 
@@ -70,7 +74,7 @@ def test_files_may_cost_what_the_table_allows():
         ("tests/b.py", Cost(), "tests/b.py has no row in tests/budget.tsv: python -m tests.budget"),
         ("tests/a.py", Cost(11, 20.0), "tests/a.py: 11 programs traced, 10 allowed"),
         ("tests/a.py", Cost(10, 21.0), "tests/a.py: 21 s of processor time, 20 allowed"),
-        ("tests/small.py", Cost(0, LEAST + 1), "tests/small.py: 5 s of processor time, 4 allowed"),
+        ("tests/small.py", Cost(0, 9.0), "tests/small.py: 9 s of processor time, 8 allowed"),
     ],
 )
 def test_files_that_cost_more_are_named(name, cost, said):
@@ -90,6 +94,14 @@ def test_a_slow_machine_may_take_longer_and_a_fast_one_as_long():
 def test_both_faults_of_a_file_are_said():
     found = excesses({"tests/a.py": Cost(11, 21.0)}, ALLOWED, 1.0)
     assert ["programs" in x for x in found] == [True, False]
+
+
+def test_all_files_together_may_not_take_longer_than_the_table():
+    spent = {"tests/a.py": Cost(10, 16.0), "tests/c.py": Cost(9, 9.0)}
+    assert excesses(spent, ALLOWED, 1.0) == []
+    spent["tests/small.py"] = Cost(0, 1.0)
+    assert excesses(spent, ALLOWED, 1.0) == ["all files: 26 s of processor time, 25 allowed"]
+    assert excesses(spent, ALLOWED, 1.1) == []
 
 
 def test_the_table_is_read(tmp_path, monkeypatch):
