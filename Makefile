@@ -10,7 +10,7 @@ BIN := .venv/bin
 PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 .DEFAULT_GOAL := help
-.PHONY: help install study explore docs docs-tests notebooks test campaigns budget smoke lint check clean venv
+.PHONY: help install study explore docs docs-tests notebooks test campaigns budget gpu smoke lint check clean venv
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /make \1\t/p' Makefile | expand -t 16
@@ -50,6 +50,9 @@ campaigns: .venv/installed  ## run the long campaigns: mutants, kills, fuzzing, 
 
 budget: .venv/installed  ## measure what each file of tests may cost, and write tests/budget.tsv
 	$(BIN)/python -m tests.budget
+
+gpu: .venv/installed  ## measure a GPU beside the cores, nine minutes at most, into docs/performance.md
+	$(BIN)/python .ci/gpu.py
 
 smoke: .venv/installed  ## run the wheel's main job on every supported Python here, core tests on the others
 	$(BIN)/python .ci/smoke.py
