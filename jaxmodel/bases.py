@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from jaxmodel.beam import ModalBasis, build_basis, held_frequency, mask_modes
+from jaxmodel.beam import ModalBasis, build_basis, held_frequency, map_modes, mask_modes
 from jaxmodel.case import Case, Structure
 from jaxmodel.lazy import compiled, jnp
 from jaxmodel.parameters import Array
@@ -81,25 +81,5 @@ def _with_stiffness(basis: ModalBasis, factor: Array) -> ModalBasis:
 def _first_modes(basis: ModalBasis, n_modes: int) -> ModalBasis:
     """A basis with fewer modes."""
     n = n_modes
-
-    def first(x: Array | None) -> Array | None:
-        return None if x is None else x[:, :n]
-
-    def square(x: Array | None) -> Array | None:
-        return None if x is None else x[:, :n, :n]
-
-    return basis._replace(
-        mass=basis.mass[:, :n],
-        stiffness=basis.stiffness[:, :n],
-        tip=first(basis.tip),
-        shortening=first(basis.shortening),
-        mixed_shortening=square(basis.mixed_shortening),
-        inward=square(basis.inward),
-        centrifugal=square(basis.centrifugal),
-        b=basis.b[:, :n],
-        c=basis.c[:, :n],
-        deflection_at=basis.deflection_at[:, :, :n],
-        sensor_slope=basis.sensor_slope[:, :n],
-        actuator_slope=basis.actuator_slope[:, :n],
-        end_slope=basis.end_slope[:, :n],
-    )
+    cut = map_modes(basis, lambda x: x[..., :n], lambda x: x[:, :n], lambda x: x[:, :n, :n])
+    return cut._replace(mass=basis.mass[:, :n], stiffness=basis.stiffness[:, :n])

@@ -126,24 +126,30 @@ def _each_link(parts: _Parts, n_links: int) -> _Parts:
 def mask_modes(basis: ModalBasis, mode_mask: Array) -> ModalBasis:
     """Switch modes off, see `build_basis`."""
     mask = jnp.broadcast_to(jnp.asarray(mode_mask, basis.mass.dtype), basis.mass.shape[1:])
+    rows = mask[:, None]
+    return map_modes(basis, lambda x: x * mask, lambda x: x * rows, lambda x: x * mask * rows)
 
-    def kept(x: Array | None, mask: Array) -> Array | None:
-        return None if x is None else x * mask
 
-    both = mask * mask[:, None]
-    return basis._replace(
-        tip=kept(basis.tip, mask),
-        shortening=kept(basis.shortening, mask),
-        mixed_shortening=kept(basis.mixed_shortening, both),
-        inward=kept(basis.inward, both),
-        centrifugal=kept(basis.centrifugal, both),
-        b=basis.b * mask,
-        c=basis.c * mask,
-        deflection_at=basis.deflection_at * mask,
-        sensor_slope=basis.sensor_slope * mask[:, None],
-        actuator_slope=basis.actuator_slope * mask[:, None],
-        end_slope=basis.end_slope * mask[:, None],
-    )
+def map_modes(
+    basis: ModalBasis,
+    last: Callable[[Array], Array],
+    rows: Callable[[Array], Array],
+    both: Callable[[Array], Array],
+) -> ModalBasis:
+    """A basis whose arrays of modes are changed, but for masses and stiffness.
+
+    Args:
+        basis: of some links.
+        last, rows, both: change arrays with modes last, last but one, and on both these axes.
+    """
+    changes = {
+        last: ("tip", "shortening", "b", "c", "deflection_at"),
+        rows: ("sensor_slope", "actuator_slope", "end_slope"),
+        both: ("mixed_shortening", "inward", "centrifugal"),
+    }
+    there = [(x, change) for change, names in changes.items() for x in names]
+    there = [(x, change) for x, change in there if getattr(basis, x) is not None]
+    return basis._replace(**{x: change(getattr(basis, x)) for x, change in there})
 
 
 def left_out_of_loads(
@@ -215,6 +221,9 @@ def _pinned_pinned(beam: Beam, patches: Patches, n_modes: int, stations: Array) 
     wave = order * np.pi / beam.length
     line_mass, mass, moment, inertia = _rigid(beam)
     sign = jnp.where(order % 2 == 1, 1.0, -1.0)  # -cos(j pi)
+    waves = np.arange(1, 2 * n_modes + 1)  # int f cos(m pi xi) dxi of f = 1 - xi and 1 - xi^2
+    beyond = np.concatenate([[1 / 2], (1 - (-1.0) ** waves) / (waves * np.pi) ** 2])
+    moment_beyond = np.concatenate([[2 / 3], -2 * (-1.0) ** waves / (waves * np.pi) ** 2])
     stiffness = bare_stiffness(beam) * beam.stiffness_factor * wave**4 * beam.length / 2
     slopes, bent = static_bending(beam, patches, stations, has_patches=False)
 
@@ -227,8 +236,13 @@ def _pinned_pinned(beam: Beam, patches: Patches, n_modes: int, stations: Array) 
         tip=None,
         shortening=wave**2 * beam.length / 2,
         mixed_shortening=None,
-        inward=wave[:, None] * wave * line_mass / 2 * _cosines(n_modes, beam.length, 0),
-        centrifugal=wave[:, None] * wave * line_mass / 4 * _cosines(n_modes, beam.length, 1),
+        inward=wave[:, None] * wave * line_mass / 2 * beam.length**2 * _products(beyond),
+        centrifugal=wave[:, None]
+        * wave
+        * line_mass
+        / 4
+        * beam.length**3
+        * _products(moment_beyond),
         b=line_mass * (1 + sign) / wave,
         c=line_mass * beam.length * sign / wave,
         link_mass=mass,
@@ -243,18 +257,13 @@ def _pinned_pinned(beam: Beam, patches: Patches, n_modes: int, stations: Array) 
     )
 
 
-def _cosines(n_modes: int, length: Array, power: int) -> Array:
-    """2 int cos(j pi x/L) cos(k pi x/L) f(x) dx, f = L - x [m2] or L^2 - x^2 [m3], (R, R)."""
-    order = jnp.arange(1, n_modes + 1)
-    parts = []
-    for n in (order[:, None] - order, order[:, None] + order):
-        wave = jnp.where(n == 0, 1, n) * np.pi / length
-        sign = jnp.where(n % 2 == 0, 1.0, -1.0)
-        if power == 0:
-            parts.append(jnp.where(n == 0, length**2 / 2, (1 - sign) / wave**2))
-        else:
-            parts.append(jnp.where(n == 0, 2 * length**3 / 3, -2 * length * sign / wave**2))
-    return parts[0] + parts[1]
+def _products(total: Array | np.ndarray, sign: int = 1) -> Array | np.ndarray:
+    """2 int f cos(j pi xi) cos(k pi xi) dxi from int f cos(m pi xi) dxi, m = 0.. 2 R, (R, R).
+
+    With sign -1 that of sines.
+    """
+    order = np.arange(1, len(total) // 2 + 1)
+    return total[abs(order[:, None] - order)] + sign * total[order[:, None] + order]
 
 
 def _pinned_free(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> ModalBasis:
@@ -370,70 +379,56 @@ def _polynomials(bends: _Bends) -> Array:
     return jnp.concatenate([smooth, jnp.einsum("mn,npd->mpd", bends.curvature, unit)])
 
 
-def _nodes(pieces: Pieces, count: int) -> tuple[Array, Array]:
-    """Gauss's nodes of each piece and their weights as shares of the link's length, (n, N)."""
-    node, weight = np.polynomial.legendre.leggauss(count)
-    width = (pieces.right - pieces.left)[:, None]
-    return pieces.left[:, None] + width * (node + 1) / 2, width * weight / 2
+def _moments(pieces: Pieces, count: int) -> tuple[Array, Array]:
+    """int xi^d sin(j pi xi) dxi and that of cos over each piece, d = 0.. 4, (count, n, 5) each."""
+    wave = np.arange(1, count + 1)[:, None] * np.pi
+    xi = jnp.concatenate([pieces.left, pieces.right[-1:]])
+    sine, cosine = _harmonics(xi, count)
+    of_sine, of_cosine = [-cosine / wave], [sine / wave]
+    for d in range(1, 5):  # by parts
+        last = of_sine[-1], of_cosine[-1]
+        of_sine.append((d * last[1] - xi**d * cosine) / wave)
+        of_cosine.append((xi**d * sine - d * last[0]) / wave)
+    return jnp.diff(jnp.stack(of_sine, -1), axis=1), jnp.diff(jnp.stack(of_cosine, -1), axis=1)
 
 
-def _sine_moments(pieces: Pieces, n_sines: int) -> Array:
-    """int xi^d sin(j pi xi) dxi over each piece, d = 0.. 3, (n_sines, n, 4)."""
-    wave = np.arange(1, n_sines + 1)[:, None] * np.pi
-
-    def risen(xi: Array) -> Array:
-        sine, cosine = jnp.sin(wave * xi), jnp.cos(wave * xi)
-        of_sine, of_cosine = [-cosine / wave], [sine / wave]
-        for d in (1, 2, 3):  # by parts
-            last = of_sine[-1], of_cosine[-1]
-            of_sine.append((d * last[1] - xi**d * cosine) / wave)
-            of_cosine.append((xi**d * sine - d * last[0]) / wave)
-        return jnp.stack(of_sine, axis=-1)
-
-    return risen(pieces.right) - risen(pieces.left)
-
-
-def _sine_products(pieces: Pieces, density: Array, n_sines: int) -> Array:
-    """int f sin(j pi xi) sin(k pi xi) dxi, f constant on each piece, (n_sines, n_sines)."""
-    wave = np.arange(1, 2 * n_sines + 1)[:, None] * np.pi
-
-    def risen(xi: Array) -> Array:
-        """int cos(m pi xi) dxi from 0, m = 0.."""
-        return jnp.concatenate([xi[None], jnp.sin(wave * xi) / wave])
-
-    total = (risen(pieces.right) - risen(pieces.left)) @ density
-    order = np.arange(1, n_sines + 1)
-    apart, both = abs(order[:, None] - order), order[:, None] + order
-    return (total[apart] - total[both]) / 2
+def _times(factor: Array, rest: Array) -> Array:
+    """Coefficients of the products of polynomials, (n, W) and (m, n, D), (m, n, W + D - 1)."""
+    degree = np.add.outer(*map(np.arange, (factor.shape[1], rest.shape[2])))
+    shift = degree[..., None] == np.arange(degree.max() + 1)
+    return jnp.einsum("nw,mnd,wde->mne", factor, rest, shift.astype(float))
 
 
 class _Integrals(NamedTuple):
-    """Exact integrals over a link, piece by piece."""
+    """Exact integrals over a link of Ritz functions times a factor, a polynomial on each piece."""
 
-    pieces: Pieces  # their ends as shares of its length [1]
-    moment: Array  # `_sine_moments`
-    xi: Array  # nodes exact for products of two cubics [1], (n, 4)
-    weight: Array  # [1], (n, 4)
+    sine: Array  # `_moments` of twice as many harmonics as there are sines
+    cosine: Array
+    power: Array  # int xi^d dxi over each piece, d = 0.. 6, (n, 7)
 
-    def single(self, density: Array, power: int, sines: np.ndarray, rest: Array) -> Array:
-        """int f xi^power y dxi of sines of these sizes, then polynomials (m, n, D), (n_s + m,)."""
-        value = self._at_nodes(rest) * self.xi**power * self.weight
-        smooth = sines * (self.moment[..., power] @ density)
-        return jnp.concatenate([smooth, jnp.sum(value, axis=2) @ density])
+    def single(self, factor: Array, sines: np.ndarray, rest: Array) -> Array:
+        """int f y dxi, f (n, W), of sines of these sizes and polynomials (m, n, D), (n_s + m,)."""
+        smooth = jnp.einsum("kpd,pd->k", self.sine[: len(sines), :, : factor.shape[1]], factor)
+        product = _times(factor, rest)
+        others = jnp.einsum("mpd,pd->m", product, self.power[:, : product.shape[2]])
+        return jnp.concatenate([sines * smooth, others])
 
-    def double(self, density: Array, sines: np.ndarray, rest: Array) -> Array:
-        """int f y z dxi likewise, of every two functions."""
-        moment = self.moment[..., : rest.shape[2]] * sines[:, None, None]
-        mixed = jnp.einsum("kpd,mpd,p->km", moment, rest, density)
-        smooth = sines[:, None] * sines * _sine_products(self.pieces, density, len(sines))
-        value = self._at_nodes(rest)
-        own = jnp.einsum("mpg,npg->mn", value * (self.weight * density[:, None]), value)
+    def double(
+        self, factor: Array, sizes: np.ndarray, rest: Array, is_cosine: bool = False
+    ) -> Array:
+        """int f y z dxi likewise, of every two functions; of cosines in place of sines."""
+        product = _times(factor, rest)
+        waves = (self.cosine if is_cosine else self.sine)[: len(sizes), :, : product.shape[2]]
+        mixed = sizes[:, None] * jnp.einsum("kpd,mpd->km", waves, product)
+        # int f cos(m pi xi) dxi, m = 0.., makes the products of two waves
+        width = factor.shape[1]
+        total = jnp.concatenate([self.power[None, :, :width], self.cosine[..., :width]])
+        total = jnp.einsum("kpd,pd->k", total, factor)
+        smooth = sizes[:, None] * sizes * _products(total, 1 if is_cosine else -1) / 2
+        degree = np.arange(rest.shape[2])[:, None] + np.arange(product.shape[2])
+        own = jnp.einsum("mpd,npe,pde->mn", rest, product, self.power[:, degree])
         top, bottom = jnp.concatenate([smooth, mixed], 1), jnp.concatenate([mixed.T, own], 1)
         return jnp.concatenate([top, bottom])
-
-    def _at_nodes(self, rest: Array) -> Array:
-        power = jnp.stack([self.xi**d for d in range(rest.shape[2])], axis=-1)
-        return jnp.einsum("mpd,pgd->mpg", rest, power)
 
 
 #: Added to the diagonal of the Ritz functions' stiffness, so that coinciding patches stay finite.
@@ -452,15 +447,18 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
         smooth, bent = _smooth_shapes(xi, n_sines), _bent_shapes(xi, bends)
         return _Shapes(*(jnp.concatenate(pair) for pair in zip(smooth, bent, strict=True)))
 
+    order = np.arange(1, 8)
+    xi = bends.pieces.left[:, None], bends.pieces.right[:, None]
     integrals = _Integrals(
-        bends.pieces, _sine_moments(bends.pieces, n_sines), *_nodes(bends.pieces, 4)
+        *_moments(bends.pieces, 2 * n_sines), (xi[1] ** order - xi[0] ** order) / order
     )
     ends = shapes(jnp.array([0.0, 1.0])).slope / length
     joint = jnp.stack([beam.joint_inertia_b, beam.joint_inertia_c])
     small, rest = 1 / (np.arange(1, n_sines + 1) * np.pi) ** 2, _polynomials(bends)
-    mass_matrix = length * integrals.double(line_mass, small, rest) + (ends * joint) @ ends.T
+    density = jnp.stack([jnp.zeros_like(line_mass), line_mass], axis=1)  # times xi
+    mass_matrix = length * integrals.double(density[:, 1:], small, rest) + (ends * joint) @ ends.T
     bent = jnp.stack([2 * rest[..., 2], 6 * rest[..., 3]], axis=2)
-    stiffness_matrix = integrals.double(stiffness, -np.ones(n_sines), bent) / length**3
+    stiffness_matrix = integrals.double(stiffness[:, None], -np.ones(n_sines), bent) / length**3
 
     # functions of unit energy; one that is absent gets a unit of its own, no mass and so no mode
     energy = jnp.diagonal(stiffness_matrix)
@@ -486,17 +484,28 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
     def slope(x: Array) -> Array:
         return coefficient.T @ shapes(x / length).slope / length
 
-    # exact to rounding for products of two slopes, which have up to 2 n_sines half-waves
-    xi, weight = (y.ravel() for y in _nodes(bends.pieces, 2 * n_sines + 16))
-    steepness, weight = slope(xi * length), weight * length
-    shortening = (steepness * weight) @ steepness.T
+    def slope_products(factor: Array) -> Array:
+        """int f Y_i' Y_j' dx."""
+        rising = rest[..., 1:] * np.array([1.0, 2.0, 3.0])
+        return (
+            coefficient.T
+            @ integrals.double(factor, np.sqrt(small), rising, is_cosine=True)
+            @ coefficient
+            / length
+        )
+
+    shortening = slope_products(jnp.ones((len(left), 1)))
     # mass and first moment of what lies beyond a point, piece by piece
-    left, right = left[:, None], right[:, None]
-    beyond_x = jnp.clip(xi * length, left, right)
+    mass, moment = line_mass * (right - left), line_mass * (right**2 - left**2) / 2
     beyond = (
-        jnp.sum(line_mass[:, None] * (right - beyond_x), axis=0),
-        jnp.sum(line_mass[:, None] * (right**2 - beyond_x**2) / 2, axis=0),
+        [jnp.sum(mass) - jnp.cumsum(mass) + line_mass * right, -line_mass * length],
+        [
+            jnp.sum(moment) - jnp.cumsum(moment) + line_mass * right**2 / 2,
+            jnp.zeros_like(left),
+            -line_mass * length**2 / 2,
+        ],
     )
+    inward, centrifugal = (slope_products(jnp.stack(x, axis=1)) for x in beyond)
     slopes, bent = static_bending(beam, patches, stations, has_patches=True)
     return ModalBasis(
         mass=jnp.full((n_modes,), 0.5) * total_mass,
@@ -504,10 +513,10 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
         tip=None,
         shortening=jnp.diagonal(shortening),
         mixed_shortening=shortening * (1 - jnp.eye(n_modes)),
-        inward=(steepness * (weight * beyond[0])) @ steepness.T,
-        centrifugal=(steepness * (weight * beyond[1])) @ steepness.T,
-        b=length * integrals.single(line_mass, 0, small, rest) @ coefficient,
-        c=(length**2 * integrals.single(line_mass, 1, small, rest) + joint @ ends.T) @ coefficient,
+        inward=inward,
+        centrifugal=centrifugal,
+        b=length * integrals.single(density[:, 1:], small, rest) @ coefficient,
+        c=(length**2 * integrals.single(density, small, rest) + joint @ ends.T) @ coefficient,
         link_mass=total_mass,
         first_moment=first_moment,
         inertia=inertia + jnp.sum(joint),

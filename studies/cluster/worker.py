@@ -22,7 +22,7 @@ from jaxmodel.case import Structure
 from studies import config, sources
 from studies.engine.chunks import JudgedChunk, start_chunk
 from studies.engine.executor import Executor
-from studies.engine.plan import chunk_cases, even_layout, local_layout
+from studies.engine.plan import MANY, chunk_cases, even_layout, local_layout
 from studies.errors import StudyError
 from studies.extensions import extend_from_environment
 from studies.space.spec import parse_sweep
@@ -144,4 +144,5 @@ def _executor(
     precision: str, spec: str, structure: Structure, size: int, has_own_ratio: bool
 ) -> Executor:
     """The sweep's own executor: numbers shared by all its cases are compiled into its program."""
-    return Executor(structure, even_layout(size), has_own_ratio)
+    is_many = len(_table(spec)) >= MANY
+    return Executor(structure, even_layout(size), has_own_ratio, is_many=is_many)

@@ -17,7 +17,7 @@ from jaxmodel.case import Case, Structure, with_ratio
 from jaxmodel.simulate import Result
 from studies.engine.executor import Executor, own_ratios
 from studies.engine.margins import judge_loops, no_margins
-from studies.engine.plan import Chunk, Group, Layout, chunk_cases, local_layout
+from studies.engine.plan import MANY, Chunk, Group, Layout, chunk_cases, local_layout
 from studies.engine.progress import Phases, Reporter
 from studies.engine.robustness import judge_robustness
 from studies.engine.stability import LoopFigures
@@ -141,7 +141,8 @@ class _BegunGroup(NamedTuple):
 
 
 def _begin(table: CaseTable, group: Group) -> _BegunGroup:
-    executor = Executor(group.structure, group.layout, has_own_ratio(table, group))
+    has_own, is_many = has_own_ratio(table, group), len(table) >= MANY
+    executor = Executor(group.structure, group.layout, has_own, is_many=is_many)
     return _BegunGroup(group, executor, _start(table, group, executor, group.chunks()[0]))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxmodel import scaling
 from jaxmodel.parameters import Array
-from studies.engine.plan import padded_rows
+from studies.engine.plan import in_parts
 from studies.engine.programs import kept_jit
 
 #: Sweeps that balance rows against columns.
@@ -49,9 +49,7 @@ def best_scaling(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         (N,), (N, m).
     """
-    rows = padded_rows(len(matrix), AT_ONCE)
-    parts = np.split(matrix[rows], len(rows) // AT_ONCE)
-    found = [np.concatenate(x)[: len(matrix)] for x in zip(*map(_best, parts), strict=True)]
+    found = in_parts(lambda rows: _best(matrix[rows]), len(matrix), AT_ONCE, 1)
     return found[0], found[1]
 
 

@@ -65,6 +65,7 @@ class Executor:
         has_own_ratio: bool = False,
         place: Place | None = None,
         kind: str = "",
+        is_many: bool = False,
     ) -> None:
         """
         Args:
@@ -73,10 +74,11 @@ class Executor:
             has_own_ratio: EMC ratios come from an uncontrolled pass for some cases.
             place: puts free parameters into a case.
             kind: how to step, a key of `STEPPERS`; default: the fastest.
+            is_many: there are so many cases that compiling longer pays.
         """
         drop_programs()
         self.structure, self.layout, self.place = structure, layout, place
-        self.has_own_ratio = has_own_ratio
+        self.has_own_ratio, self._is_many = has_own_ratio, is_many
         self._kind, self._reason = kind or stepper(structure), ""
         self._function: BlockFunction | None = None
         self._pool = ThreadPoolExecutor(layout.devices)
@@ -167,7 +169,7 @@ class Executor:
         """The function of a block, compiled."""
 
         def make(kind: str) -> BlockFunction:
-            return block_function(self.structure, build, free, own, shared, kind)
+            return block_function(self.structure, build, free, own, shared, kind, self._is_many)
 
         try:
             function = make(self._kind)

@@ -51,6 +51,8 @@ STEPPERS = {"kernel": "traced kernel", "gpu": "GPU kernel", "scan": "XLA scan"}
 #: before they are traced.
 _NOT_KEPT = ("prepare_vjp", "finish_vjp", "finish_jvp")
 _FUNCTIONS: dict[Any, BlockFunction] = {}
+#: Cases prepared side by side on a core: what each is to follow then stays in its cache.
+GROUP = 16
 
 
 def stepper(structure: Structure) -> str:
@@ -88,6 +90,7 @@ class BlockFunction:
         own: Any,
         shared: Any,
         kind: str,
+        is_many: bool = False,
     ) -> None:
         """
         Args:
@@ -96,11 +99,12 @@ class BlockFunction:
             free, own: numbers of a block, or of one as large; only the first case is looked at.
             shared: numbers of all cases.
             kind: how to step, a key of `STEPPERS`.
+            is_many: there are so many blocks that compiling longer pays.
 
         Raises:
             NoKernelError: the steps use what kernels do not support.
         """
-        self.structure, self.build, self.kind = structure, build, kind
+        self.structure, self.build, self.kind, self._is_many = structure, build, kind, is_many
         self.lanes = len(jax.tree.leaves((free, own))[0])
         self._numbers, self._names = shared, _names(structure, build, kind, free, own, shared)
         first = [*jax.tree.map(lambda x: x[0], (free, own)), shared]
@@ -126,7 +130,18 @@ class BlockFunction:
 
     def prepare(self, free: Any, own: Any, shared: Any) -> list[Any]:
         """Those leaves of the cases' starts that vary, lanes last."""
-        return self._prepared(0, free, own, shared)
+        if self.kind == "gpu" or self.lanes % GROUP:
+            return self._prepared(0, free, own, shared)
+
+        def split(x: Any) -> Any:
+            return jnp.reshape(x, (-1, GROUP, *x.shape[1:]))
+
+        def joined(x: Any) -> Any:
+            return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], self.lanes)
+
+        groups = jax.tree.map(split, (free, own))
+        each = jax.lax.map(lambda group: self._prepared(0, group[0], group[1], shared), groups)
+        return [joined(x) for x in each]
 
     def _prepared(self, free_axis: int | None, free: Any, own: Any, shared: Any) -> list[Any]:
         """As `prepare`; free numbers without an axis are those of all cases."""
@@ -291,13 +306,13 @@ class BlockFunction:
     def _compiled(self, name: str, function: Callable[..., Any], *arguments: Any) -> Any:
         def lower() -> Any:
             is_quick = self.kind == "kernel" and not name.startswith("finish")  # which steps
-            options = quick_options() if is_quick else None
+            options = quick_options(int(self._is_many)) if is_quick else None
             return jax.jit(function, compiler_options=options).lower(*arguments)
 
         with self._compiling:
             if name not in self._programs:
                 if self._names and name not in _NOT_KEPT:
-                    names = [name, *self._names]
+                    names = [name, self._is_many, *self._names]
                     self._programs[name] = program(names, list(arguments), lower, __name__)
                 else:
                     self._programs[name] = lower().compile()
@@ -369,13 +384,20 @@ class BlockFunction:
 
 
 def block_function(
-    structure: Structure, build: Build, free: Any, own: Any, shared: Any, kind: str = ""
+    structure: Structure,
+    build: Build,
+    free: Any,
+    own: Any,
+    shared: Any,
+    kind: str = "",
+    is_many: bool = False,
 ) -> BlockFunction:
     """The function of a block, made once per process for the same numbers shared by all cases.
 
     Args:
         structure, build, free, own, shared: as for `BlockFunction`.
         kind: key of `STEPPERS`; default: the fastest.
+        is_many: as there.
 
     Raises:
         NoKernelError: no such kernel.
@@ -383,11 +405,11 @@ def block_function(
     kind = kind or stepper(structure)
     shapes = tuple(np.shape(x) for x in jax.tree.leaves((free, own)))
     numbers = tuple((np.shape(x), np.asarray(x).tobytes()) for x in jax.tree.leaves(shared))
-    key = structure, build, shapes, numbers, kind, _real(), native.this_processor()
+    key = structure, build, shapes, numbers, kind, is_many, _real(), native.this_processor()
     if key not in _FUNCTIONS:
         while len(_FUNCTIONS) >= KEPT_FUNCTIONS:
             del _FUNCTIONS[next(iter(_FUNCTIONS))]
-        _FUNCTIONS[key] = BlockFunction(structure, build, free, own, shared, kind)
+        _FUNCTIONS[key] = BlockFunction(structure, build, free, own, shared, kind, is_many)
     return _FUNCTIONS[key]
 
 

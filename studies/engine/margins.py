@@ -19,6 +19,7 @@ from jaxmodel.judge import LoopVerdicts, can_judge, judge, with_margin_modes
 from jaxmodel.laws import LAWS
 from jaxmodel.steps import GROUP, Steps
 from studies.config import hosts, on_host
+from studies.engine.plan import in_parts, padded_rows
 from studies.engine.stability import LoopFigures, loop_report, modes_alone
 from studies.engine.steps import program_of_steps
 from studies.threads import serial_blas
@@ -41,38 +42,34 @@ def judge_loops(structure: Structure, cases: Case) -> LoopFigures:
     count, figures = _count(cases), no_margins(structure, cases)
     structure, cases = with_margin_modes(structure, cases)
     whole = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape[1:])), cases)
+    is_known = np.zeros(count, bool)
+    if can_judge(structure):
+        is_known = _judge_blocks(structure, whole, figures)
     with serial_blas(), ThreadPoolExecutor(len(hosts())) as pool:
-        is_known = np.zeros(count, bool)
-        if can_judge(structure):
-            is_known = _judge_blocks(structure, whole, figures, pool)
         by_eigenvalues = partial(_judge_by_eigenvalues, structure, whole, figures)
         deque(pool.map(by_eigenvalues, map(int, np.flatnonzero(~is_known))), 0)
     return figures
 
 
-def _judge_blocks(
-    structure: Structure, cases: Case, figures: LoopFigures, pool: ThreadPoolExecutor
-) -> np.ndarray:
+def _judge_blocks(structure: Structure, cases: Case, figures: LoopFigures) -> np.ndarray:
     """Write the figures of all cases; returns which of them are known."""
     count, canonical = _count(cases), jax.dtypes.canonicalize_dtype
     size, most = GROUP, structure.n_links
     if count > FEW:  # idle links cost nothing; one number, since each has its own programs
         size, most = BLOCK, max(1, int(np.sum(cases.control.link_mask > 0, axis=1).max()))
-    blocks = [np.minimum(np.arange(k, k + size), count - 1) for k in range(0, count, size)]
 
     def block(rows: np.ndarray) -> Case:
         some: Case = jax.tree.map(lambda x: x[rows].astype(canonical(x.dtype)), cases)
         return some
 
     with on_host():
-        run = program_of_steps(_judged, [structure, most], block(blocks[0]))
+        run = program_of_steps(_judged, [structure, most], block(padded_rows(1, size)))
 
         def judge_block(rows: np.ndarray) -> LoopVerdicts:
             with on_host():
                 return jax.tree.map(np.asarray, run(block(rows)))
 
-        judged = list(pool.map(judge_block, blocks))
-    whole = jax.tree.map(lambda *x: np.concatenate(x)[:count], *judged)
+        whole = in_parts(judge_block, count, size, len(hosts()))
     for name, value in whole._asdict().items():
         if name != "is_known":
             getattr(figures, name)[:] = value

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import resource
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -22,6 +23,7 @@ from studies.kernels.cpu import LANE_BYTES
 from studies.kernels.gpu import BLOCK
 from studies.space.table import CaseTable, loose_study
 from studies.study.cases import build_cases, build_structure, in_working_precision
+from studies.threads import serial_blas
 
 #: Fields that change the program; each combination of their values is compiled separately.
 STATIC = (
@@ -43,6 +45,8 @@ STATIC = (
 )
 #: More programs than this are rejected.
 PROGRAM_LIMIT = 64
+#: From so many cases on, programs that prepare them are worth compiling longer.
+MANY = 8192
 #: Cases side by side on one device: enough to fill vectors, few enough to fit into its cache.
 LANES = 64
 #: On a GPU: enough for all its threads.
@@ -318,6 +322,23 @@ def lane_unit() -> int:
 def padded_rows(count: int, unit: int) -> np.ndarray:
     """Numbers of `count` rows, the last one repeated until `unit` divides how many there are."""
     return np.minimum(np.arange(-(-count // unit) * unit), count - 1)
+
+
+def in_parts(
+    evaluate: Callable[[np.ndarray], Any], count: int, size: int, cores: int | None
+) -> Any:
+    """Arrays of rows from those of parts of equal size, which cores take in turn.
+
+    Args:
+        evaluate: makes a tree of arrays (size, ...) of rows (size,).
+        count: of rows; the last one fills the last part up.
+        size: of a part.
+        cores: how many take parts.
+    """
+    rows = padded_rows(count, size)
+    with serial_blas(), ThreadPoolExecutor(cores) as pool:
+        parts = list(pool.map(evaluate, np.split(rows, len(rows) // size)))
+    return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
 
 
 def memory_budget() -> int:

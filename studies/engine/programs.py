@@ -47,23 +47,23 @@ _STAYED = [0]
 _PROGRAMS: dict[str, Any] = {}
 
 
-#: Compiler options with which XLA takes half of its default time, and with the further one a fifth,
-#: for about the same run time. Not for every program: a scan over time runs seven times slower, and
-#: a derivative with many shared terms can take minutes to compile. jaxlib 0.11 lacks the second.
-_QUICK: dict[str, Any] = {"xla_backend_optimization_level": 0}
-_QUICKER = _QUICK | {"xla_cpu_use_fusion_emitters": False}
-
-
 @cache
-def quick_options() -> dict[str, Any]:
-    """Compiler options for programs on this machine's cores that are used for a few cases."""
+def quick_options(effort: int = 0) -> dict[str, Any]:
+    """Compiler options for programs on this machine's cores.
+
+    With effort 0 XLA takes a fifth of its default time, for a few cases; with 1 three quarters, for
+    programs that then run in about a third of the time. Not for every program: a scan over time
+    runs seven times slower, and a derivative with many shared terms can take minutes to compile.
+    """
+    found: dict[str, Any] = {"xla_backend_optimization_level": effort}
+    quicker = found | {"xla_cpu_use_fusion_emitters": False}
     with on_host():
         lowered = jax.jit(lambda: 0).lower()
     try:
-        lowered.compile(compiler_options=_QUICKER)
-    except (RuntimeError, ValueError):  # an option that this jaxlib does not know
-        return _QUICK
-    return _QUICKER
+        lowered.compile(compiler_options=quicker)
+    except (RuntimeError, ValueError):  # an option that this jaxlib does not know, as 0.11
+        return found
+    return quicker
 
 
 class KeptFunction:

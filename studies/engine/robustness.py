@@ -8,7 +8,6 @@ NumPy, several loops at once; norms by a compiled program.
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -31,10 +30,9 @@ from studies.engine.delay_check import DelayedLoops, checked_delays
 from studies.engine.disk_margin import LARGEST, disk_margins
 from studies.engine.loop_gain import LoopGains, acting_commands, loop_gains
 from studies.engine.margin_grid import GridGain, search_grid
-from studies.engine.plan import padded_rows
+from studies.engine.plan import in_parts
 from studies.engine.programs import kept_jit
 from studies.engine.stability import modes_alone
-from studies.threads import serial_blas
 
 #: Loops per call; each core takes one call after another.
 BATCH = 8
@@ -93,8 +91,6 @@ def _figures_of(
 ) -> dict[str, np.ndarray]:
     structure, cases = with_margin_modes(structure, cases)
     whole = jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x)[1:])), cases)
-    rows = padded_rows(count, BATCH)
-    batches = np.split(rows, len(rows) // BATCH)
     has_delay = "delay_margin" in names and not LAWS[structure.law].is_switching
 
     def judge(part: np.ndarray) -> dict[str, np.ndarray]:
@@ -107,9 +103,8 @@ def _figures_of(
             margins["delay_margin"] = checked_delays(loops, margins["delay_margin"])
         return margins | _peaks_of(response, tuple(x for x in names if x in PEAKS))
 
-    with serial_blas(), ThreadPoolExecutor(len(hosts())) as pool:
-        judged = list(pool.map(judge, batches))
-    return {name: np.concatenate([part[name] for part in judged])[:count] for name in names}
+    judged: dict[str, np.ndarray] = in_parts(judge, count, BATCH, len(hosts()))
+    return judged
 
 
 def _peaks_of(response: SampledLoopResponse, names: tuple[str, ...]) -> dict[str, np.ndarray]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,12 +17,11 @@ import numpy as np
 from jaxmodel.case import Structure
 from jaxmodel.loop_figures import MARGINS, PEAKS
 from jaxmodel.parameters import Array
-from studies.engine.plan import padded_rows
+from studies.engine.plan import in_parts
 from studies.engine.robustness import find_margins
 from studies.errors import StudyError
 from studies.study.cases import build_structure, in_working_precision
 from studies.study.numbers import Numbers, stack_numbers, study_numbers
-from studies.threads import serial_blas
 from studies.tuning.loop_figures import (
     allowed_on,
     figures_of_cases,
@@ -266,15 +264,12 @@ class LinearFidelity:
             size: of a part; the last row fills the last one up.
             evaluate: function of rows (size,), a tuple of arrays with these first.
         """
-        rows = padded_rows(count, size)
-        parts = np.split(rows, len(rows) // size)
         # two threads would compile the same program twice
         program = evaluate.__qualname__, batch.structure, size
         cores = os.cpu_count() if program in self._compiled else 1
         self._compiled.add(program)
-        with serial_blas(), ThreadPoolExecutor(cores) as pool:
-            results = list(pool.map(lambda part: jax.tree.map(np.asarray, evaluate(part)), parts))
-        return tuple(np.concatenate(x)[:count] for x in zip(*results, strict=True))
+        found = in_parts(lambda x: jax.tree.map(np.asarray, evaluate(x)), count, size, cores)
+        return tuple(found)
 
     def _batch_of(self, position: int) -> _Batch:
         return next(x for x in self._batches.values() if position in x.rows)

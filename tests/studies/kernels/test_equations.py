@@ -175,7 +175,7 @@ def test_gradients_are_those_of_the_scan_where_kernels_fail(monkeypatch):
         assert is_differentiated
         raise NoKernelError("an operation that kernels do not know")
 
-    def made(structure, build, free, own, shared, kind):
+    def made(structure, build, free, own, shared, kind, is_many):
         scan = SimpleNamespace(linearise=lambda free, own: ({"free": free}, None))
         return scan if kind == "scan" else SimpleNamespace(compile=failing)
 
