@@ -10,13 +10,15 @@ import pytest
 from jaxmodel import status
 from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import simulate
-from studies.engine.executor import Differentiated, Executor
+from studies.engine import function
+from studies.engine.executor import CaseLeaves, Differentiated, Executor
 from studies.engine.plan import Layout
 from studies.engine.runs import _simulate
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure
 from tests.bare import paper_study
 
 N_CASES = 16
+QUICK = {"xla_backend_optimization_level": 0}
 
 
 def short_study(**changes):
@@ -73,6 +75,28 @@ def test_the_command_of_a_platform_at_rest_is_computed_once(points, is_shared):
     varies = jax.tree.unflatten(function.parts.tree, function.parts.is_varying).inputs
     assert varies.window.after_command
     assert {varies.rho, varies.rho_rate, varies.pose} == {not is_shared}
+
+
+def test_cases_are_prepared_in_groups_and_with_more_effort_where_they_are_many(monkeypatch):
+    study = short_study()
+    structure, lanes = build_structure(study), 2 * function.GROUP
+    gains = {"control.gain_factor": np.linspace(0.1, 0.5, lanes)}
+    leaves, tree = jax.tree.flatten(build_cases(study, gains, structure))
+    is_own = tuple(len(leaf) > 1 for leaf in leaves)
+    own = [x for x, yes in zip(leaves, is_own, strict=True) if yes]
+    shared = [x[0] for x, yes in zip(leaves, is_own, strict=True) if not yes]
+    made, efforts = [], []
+    monkeypatch.setattr(function, "quick_options", lambda effort: efforts.append(effort) or QUICK)
+    for size, is_many in ((function.GROUP, False), (function.GROUP, True), (lanes + 1, False)):
+        monkeypatch.setattr(function, "GROUP", size)
+        block = function.BlockFunction(
+            structure, CaseLeaves(tree, is_own), (), own, shared, "kernel", is_many
+        )
+        made.append(block._program("prepare", block.prepare, (), own, shared))
+    assert set(efforts) == {0, 1}
+    for grouped, effort, whole in zip(*made, strict=True):
+        np.testing.assert_allclose(grouped, whole, rtol=1e-12)
+        np.testing.assert_allclose(effort, whole, rtol=1e-12)
 
 
 def test_gradients_of_several_numbers_are_those_of_their_own_metrics():
