@@ -46,7 +46,7 @@ STATIC = (
 #: More programs than this are rejected.
 PROGRAM_LIMIT = 64
 #: From so many cases on, programs that prepare them are worth compiling longer.
-MANY = 4096
+MANY = 8192
 #: Cases side by side on one device: enough to fill vectors, few enough to fit into its cache.
 LANES = 64
 #: On a GPU: enough for all its threads.
