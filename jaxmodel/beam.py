@@ -225,6 +225,7 @@ def _pinned_pinned(beam: Beam, patches: Patches, n_modes: int, stations: Array) 
     beyond = np.concatenate([[1 / 2], (1 - (-1.0) ** waves) / (waves * np.pi) ** 2])
     moment_beyond = np.concatenate([[2 / 3], -2 * (-1.0) ** waves / (waves * np.pi) ** 2])
     stiffness = bare_stiffness(beam) * beam.stiffness_factor * wave**4 * beam.length / 2
+    scale = wave[:, None] * wave * line_mass / 2 * beam.length**2
     slopes, bent = static_bending(beam, patches, stations, has_patches=False)
 
     def slope(x: Array) -> Array:
@@ -236,13 +237,8 @@ def _pinned_pinned(beam: Beam, patches: Patches, n_modes: int, stations: Array) 
         tip=None,
         shortening=wave**2 * beam.length / 2,
         mixed_shortening=None,
-        inward=wave[:, None] * wave * line_mass / 2 * beam.length**2 * _products(beyond),
-        centrifugal=wave[:, None]
-        * wave
-        * line_mass
-        / 4
-        * beam.length**3
-        * _products(moment_beyond),
+        inward=scale * _products(beyond),
+        centrifugal=scale * beam.length / 2 * _products(moment_beyond),
         b=line_mass * (1 + sign) / wave,
         c=line_mass * beam.length * sign / wave,
         link_mass=mass,
