@@ -110,7 +110,11 @@ def code_cells(book):
 
 
 def execute(book):
-    NotebookClient(book, timeout=300, kernel_name="python3", allow_errors=True).execute()
+    # on a busy machine, output may come more than the 4 s of the default after the reply
+    client = NotebookClient(
+        book, timeout=300, iopub_timeout=120, kernel_name="python3", allow_errors=True
+    )
+    client.execute()
 
 
 def check_outputs(book):
