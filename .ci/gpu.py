@@ -33,7 +33,7 @@ EQUAL = 1e-8
 WORKS = {"W0": 32768, "W1": 8448, "W8": 8448, "grad": 1024}
 JUDGED = 8192
 #: A sweep of short runs with margins, and a screen of as short ones.
-CASES, DESIGNS = 65_536, 200_000
+CASES, DESIGNS = 65_536, 500_000
 SWEEP = """title = "judged"
 link = {{ modes = 2 }}
 run = {{ duration = 0.05 }}
