@@ -78,8 +78,7 @@ def _with_stiffness(basis: ModalBasis, factor: Array) -> ModalBasis:
     )
 
 
-def _first_modes(basis: ModalBasis, n_modes: int) -> ModalBasis:
-    """A basis with fewer modes."""
-    n = n_modes
+def _first_modes(basis: ModalBasis, n: int) -> ModalBasis:
+    """A basis with its first n modes."""
     cut = map_modes(basis, lambda x: x[..., :n], lambda x: x[:, :n], lambda x: x[:, :n, :n])
     return cut._replace(mass=basis.mass[:, :n], stiffness=basis.stiffness[:, :n])

@@ -142,14 +142,15 @@ def map_modes(
         basis: of some links.
         last, rows, both: change arrays with modes last, last but one, and on both these axes.
     """
-    changes = {
-        last: ("tip", "shortening", "b", "c", "deflection_at"),
-        rows: ("sensor_slope", "actuator_slope", "end_slope"),
-        both: ("mixed_shortening", "inward", "centrifugal"),
-    }
-    there = [(x, change) for change, names in changes.items() for x in names]
-    there = [(x, change) for x, change in there if getattr(basis, x) is not None]
-    return basis._replace(**{x: change(getattr(basis, x)) for x, change in there})
+
+    def changed(change: Callable[[Array], Array], *names: str) -> dict[str, Array]:
+        return {x: change(y) for x in names if (y := getattr(basis, x)) is not None}
+
+    return basis._replace(
+        **changed(last, "tip", "shortening", "b", "c", "deflection_at"),
+        **changed(rows, "sensor_slope", "actuator_slope", "end_slope"),
+        **changed(both, "mixed_shortening", "inward", "centrifugal"),
+    )
 
 
 def left_out_of_loads(

@@ -28,7 +28,7 @@ from jaxmodel.loop import State, step
 from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import Outline, Result, Start, begin, conclude
 from studies import sources
-from studies.config import is_keeping, processor
+from studies.config import device_now, is_keeping, processor
 from studies.engine.programs import is_plain, kept_data, modules_of, program, quick_options
 from studies.errors import NoKernelError, warn_of_scan
 from studies.kernels import bridge, gpu, llvm, native
@@ -130,7 +130,7 @@ class BlockFunction:
 
     def prepare(self, free: Any, own: Any, shared: Any) -> list[Any]:
         """Those leaves of the cases' starts that vary, lanes last."""
-        if self.kind == "gpu" or self.lanes % GROUP:
+        if device_now().platform != "cpu" or self.lanes % GROUP:
             return self._prepared(0, free, own, shared)
 
         def split(x: Any) -> Any:
@@ -304,15 +304,17 @@ class BlockFunction:
         return jax.block_until_ready(self._compiled(name, function, *arguments)(*arguments))
 
     def _compiled(self, name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        is_quick = self.kind == "kernel" and not name.startswith("finish")  # which steps
+        effort = int(self._is_many and name == "prepare")  # others run once, or as fast without
+
         def lower() -> Any:
-            is_quick = self.kind == "kernel" and not name.startswith("finish")  # which steps
-            options = quick_options(int(self._is_many)) if is_quick else None
+            options = quick_options(effort) if is_quick else None
             return jax.jit(function, compiler_options=options).lower(*arguments)
 
         with self._compiling:
             if name not in self._programs:
                 if self._names and name not in _NOT_KEPT:
-                    names = [name, self._is_many, *self._names]
+                    names = [name, effort, *self._names]
                     self._programs[name] = program(names, list(arguments), lower, __name__)
                 else:
                     self._programs[name] = lower().compile()

@@ -67,7 +67,7 @@ def _judge_blocks(structure: Structure, cases: Case, figures: LoopFigures) -> np
 
         def judge_block(rows: np.ndarray) -> LoopVerdicts:
             with on_host():
-                return jax.tree.map(np.asarray, run(block(rows)))
+                return run(block(rows))
 
         whole = in_parts(judge_block, count, size, len(hosts()))
     for name, value in whole._asdict().items():

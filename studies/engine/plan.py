@@ -336,8 +336,9 @@ def in_parts(
         cores: how many take parts.
     """
     rows = padded_rows(count, size)
-    with serial_blas(), ThreadPoolExecutor(cores) as pool:
-        parts = list(pool.map(evaluate, np.split(rows, len(rows) // size)))
+    split = np.split(rows, len(rows) // size)
+    with serial_blas(), ThreadPoolExecutor(cores) as pool:  # each thread waits for its part
+        parts = list(pool.map(lambda x: jax.tree.map(np.asarray, evaluate(x)), split))
     return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
 
 

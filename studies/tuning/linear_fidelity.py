@@ -268,8 +268,8 @@ class LinearFidelity:
         program = evaluate.__qualname__, batch.structure, size
         cores = os.cpu_count() if program in self._compiled else 1
         self._compiled.add(program)
-        found = in_parts(lambda x: jax.tree.map(np.asarray, evaluate(x)), count, size, cores)
-        return tuple(found)
+        found: tuple[np.ndarray, ...] = in_parts(evaluate, count, size, cores)
+        return found
 
     def _batch_of(self, position: int) -> _Batch:
         return next(x for x in self._batches.values() if position in x.rows)
