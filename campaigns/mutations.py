@@ -40,7 +40,6 @@ from studies.engine.folder import (
 from studies.engine.folder import finished_cases as finished
 from studies.engine.results import DIGEST, baseline_digest, baseline_id, read_sweep
 from studies.engine.stored import manifest_attributes, merge
-from studies.engine.sweep import case_content
 from studies.errors import StudyError
 from studies.explorer.page import explorer_page
 from studies.export.document import (
@@ -65,6 +64,7 @@ from studies.space.table import build_table
 from studies.store import Variable, write_store
 from studies.study.files import READY, read_toml
 from studies.study.spec import Study, load_study
+from studies.sweeps.run import case_content
 from studies.sweeps.show import print_cases, ranked_cases, show
 from studies.tuning import explore as tuning_explorer
 from studies.tuning.folder import RESULTS as TUNED

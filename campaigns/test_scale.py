@@ -12,7 +12,8 @@ import pytest
 
 from studies.engine.folder import CHUNKS
 from studies.engine.results import read_sweep
-from studies.screen.run import LocalScreener, run_screen
+from studies.screen.local import LocalScreener
+from studies.screen.run import run_screen
 from studies.screen.shards import screen_of
 from studies.space.spec import load_sweep
 from studies.study.files import READY, read_toml

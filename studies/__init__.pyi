@@ -10,7 +10,6 @@ from .engine.design import load_design
 from .engine.modes import machine_modes
 from .engine.run_data import chord_deflection
 from .engine.runs import Run, run_study
-from .engine.sweep import make_plan, run_sweep
 from .errors import StudyError
 from .explore import explore_results
 from .export.document import import_study
@@ -33,6 +32,7 @@ from .study.spec import Study, load_study, paper_study, parse_study
 from .study.template import write_study
 from .sweeps.plots import plot
 from .sweeps.report import write_sweep_report
+from .sweeps.run import make_plan, run_sweep
 from .sweeps.sensitivity import analyse
 from .sweeps.show import best_cases, table
 from .tuning.audit import audit

@@ -39,7 +39,6 @@ from studies.engine.columns import axis_variables
 from studies.engine.folder import ATLASES, locked_folder, refuse_existing
 from studies.engine.progress import Phases
 from studies.engine.run_data import run_attributes
-from studies.engine.sweep import run_sweep, sweep_phases
 from studies.errors import StudyError
 from studies.publish import REPORT, publish
 from studies.show.figures import draw
@@ -47,6 +46,7 @@ from studies.show.sketch import sketch
 from studies.space.spec import SweepSpec
 from studies.store import Variable, axis_sizes, write_store
 from studies.study.spec import Study
+from studies.sweeps.run import run_sweep, sweep_phases
 from studies.threads import serial_blas
 
 DATA, RUNS_FOLDER, MODES_FOLDER = "atlas.h5", ATLASES.mark, "runs_modes"

@@ -21,13 +21,13 @@ from studies.engine.executor import Executor
 from studies.engine.function import STEPPERS
 from studies.engine.plan import Layout, even_layout, most_lanes, peak_memory
 from studies.engine.results import read_sweep
-from studies.engine.sweep import run_sweep
 from studies.errors import StudyError, field_error
 from studies.kernels.compilation import compiler_time
 from studies.kernels.llvm import is_available
 from studies.space.spec import parse_sweep
 from studies.study.cases import build_cases, build_structure, in_working_precision
 from studies.study.spec import paper_study
+from studies.sweeps.run import run_sweep
 
 #: A sweep of very short runs: ten samples of a released link, so that the engine itself is timed.
 SHORT_RUNS: dict[str, Any] = {

@@ -9,7 +9,7 @@ import re
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from importlib.util import find_spec
 from ipaddress import ip_address
 from multiprocessing import current_process, resource_tracker
@@ -26,9 +26,6 @@ from studies.reading import read_json
 
 if TYPE_CHECKING:
     from distributed import Client
-
-    from studies.engine.chunks import Runner
-    from studies.space.spec import SweepSpec
 
 
 T = TypeVar("T")
@@ -61,11 +58,11 @@ ANSWER_TIME = 60
 
 
 class Workers(NamedTuple):
-    """Where to run, as requested on the command line."""
+    """Where to run."""
 
-    scheduler: str | None  # address (tcp://host:8786, tls://...) or the scheduler's file (JSON)
-    local: int | None  # or how many processes to start on this machine
-    timeout: float  # a worker that stays busy for longer without answering is restarted [s]
+    scheduler: str | None = None  # address (tcp://..., tls://...) or the scheduler's file (JSON)
+    local: int | None = None  # or how many processes to start on this machine
+    timeout: float = TIMEOUT  # a worker busy for longer without an answer is restarted [s]
 
     @property
     def options(self) -> str:
@@ -86,49 +83,42 @@ class Workers(NamedTuple):
         cores = usable_cores()
         if self.are_named or cores < MANY or not is_large or processor() != "cpu":
             return self
-        if find_spec("distributed") is None:
-            say(f"one process uses about four of {cores} cores; flexlink-studies[cluster] uses all")
+        reason = "" if find_spec("distributed") else "flexlink-studies[cluster] uses all"
+        if reason := reason or _unguarded():
+            say(f"one process uses about four of {cores} cores; {reason}")
             return self
         say(f"{cores // 2} processes share {cores} cores; --local-workers 1: one uses about four")
         return self._replace(local=cores // 2)
 
 
-def runner_for(
-    spec: SweepSpec, workers: Workers, on_progress: Callable[[str], None]
-) -> AbstractContextManager[Runner | None]:
-    """The runner of a sweep on workers, None for this process.
-
-    Raises:
-        StudyError: as `connected`.
-    """
-
-    def make(client: Client) -> Runner:
-        from studies.cluster.runner import ClusterRunner
-
-        return ClusterRunner(client, spec, workers.timeout)
-
-    return on_workers(workers, on_progress, make)
+#: Workers as users name them: a number of processes on this machine, a scheduler's address or file;
+#: None: all cores where that is worth their start.
+Place = Workers | int | str | None
 
 
 @contextmanager
 def on_workers(
-    workers: Workers, on_progress: Callable[[str], None], make: Callable[[Client], T]
+    place: Place, is_large: bool, say: Callable[[str], None], make: Callable[[Client, float], T]
 ) -> Iterator[T | None]:
-    """Make something from a client of the workers, None if no workers are named.
+    """Make something from a client of the workers, None for this process.
 
     Args:
-        workers: which ones.
-        on_progress: called with progress messages.
-        make: called with the client.
+        place: which workers.
+        is_large: the work is worth the start of workers that are not asked for.
+        say: called with progress messages.
+        make: called with the client and the workers' time limit [s].
 
     Raises:
         StudyError: as `connected`.
     """
+    if not isinstance(place, Workers):
+        place = Workers(scheduler=place) if isinstance(place, str) else Workers(local=place)
+    workers = place.with_default(is_large, say)
     if not workers.are_named:
         yield None
         return
-    with connected(workers, on_progress) as client:
-        yield make(client)
+    with connected(workers, say) as client:
+        yield make(client, workers.timeout)
 
 
 @contextmanager
@@ -261,7 +251,7 @@ def _unguarded() -> str:
     script = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
     if not script.is_file() or "__main__" in script.read_text("utf-8", errors="replace"):
         return ""
-    return f'they import {script}: put what it does under if __name__ == "__main__":'
+    return f'workers import {script}: put what it does under if __name__ == "__main__":'
 
 
 @contextmanager

@@ -97,11 +97,11 @@ class ChunkOf(NamedTuple):
 class ClusterRunner:
     """Runs the chunks of one sweep on a cluster; a `studies.engine.chunks.Runner`."""
 
-    def __init__(self, client: Client, spec: SweepSpec, timeout: float) -> None:
+    def __init__(self, spec: SweepSpec, client: Client, timeout: float) -> None:
         """
         Args:
-            client: from `connected`.
             spec: the sweep.
+            client: from `connected`.
             timeout: a worker that stays busy for longer without answering is restarted [s].
         """
         self._client, self._timeout = client, timeout
@@ -111,7 +111,8 @@ class ClusterRunner:
     def layout(self, n: int, structure: Structure) -> Layout:
         wait_for_workers(self._client)
         share = -(-n // (LEAST_CHUNKS * max(len(self._client.ncores()), 1)))
-        future = self._client.submit(chunk_size, share, structure, self._precision, pure=False)
+        job = self._identity, share, structure, self._precision
+        future = self._client.submit(chunk_size, *job, pure=False)
         try:
             size: int = future.result(timeout=self._timeout)
         except StudyError:

@@ -13,10 +13,9 @@ from contextlib import contextmanager
 from functools import cache, lru_cache
 from importlib.metadata import version
 from threading import RLock
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from distributed import Worker, get_worker
 
 from jaxmodel.case import Structure
 from studies import config, sources
@@ -27,6 +26,9 @@ from studies.errors import StudyError
 from studies.extensions import extend_from_environment
 from studies.space.spec import parse_sweep
 from studies.space.table import CaseTable, build_table
+
+if TYPE_CHECKING:
+    from distributed import Worker
 
 #: One chunk at a time: it uses the whole worker.
 alone = RLock()
@@ -78,41 +80,31 @@ def difference(versions: dict[str, str], expected: dict[str, str]) -> str:
     return ", ".join(parts)
 
 
-def refuse_difference(expected: dict[str, str], worker: Worker) -> None:
-    """Raise StudyError if this worker, which may have joined late, differs from the client."""
-    fault = difference(identity(), expected)
-    if fault:
-        raise StudyError(f"worker {worker.address}: {fault}; install the same there")
-
-
-def configure_worker(precision: str, worker: Worker) -> None:
-    """Start JAX on the worker's share of the machine: one core per thread."""
-    config.configure(precision, worker.state.nthreads)
-    config.start(precision)
-
-
 @contextmanager
 def working(expected: dict[str, str], precision: str) -> Iterator[Worker]:
-    """This worker, for one job that has all of it.
+    """This worker, for one job that has all of it: JAX uses one core per thread.
 
     Args:
         expected: versions of the client, from `identity`.
         precision: of the job.
 
     Raises:
-        StudyError: the worker has other versions than the client.
+        StudyError: the worker, which may have joined late, has other versions than the client.
     """
+    from distributed import get_worker  # an extra
+
     with alone:
         worker = get_worker()
-        refuse_difference(expected, worker)
-        configure_worker(precision, worker)
+        if fault := difference(identity(), expected):
+            raise StudyError(f"worker {worker.address}: {fault}; install the same there")
+        config.configure(precision, worker.state.nthreads)
+        config.start(precision)
         yield worker
 
 
-def chunk_size(n: int, structure: Structure, precision: str) -> int:
-    """How many of n cases this worker prefers to run at once."""
-    with alone:
-        configure_worker(precision, get_worker())
+def chunk_size(expected: dict[str, str], n: int, structure: Structure, precision: str) -> int:
+    """How many of n cases this worker prefers to run at once; expected: as in `working`."""
+    with working(expected, precision):
         return local_layout(n, structure).size
 
 

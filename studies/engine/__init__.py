@@ -11,8 +11,8 @@ In: a `Study`, or a `Table` of cases. Out: metrics and judgements, as arrays or 
   a chunk's blocks on threads, `batched` hands the function to users. `margins` and `damping`
   judge every loop, by `lanes`. `chunks` runs and judges one chunk.
 - Files: `folder` keeps each finished chunk, whatever happens; `columns` defines the contents of
-  files, `stored` writes and joins them, `results` reads them. `sweep` drives all this, `progress`
-  reports on it.
+  files, `stored` writes and joins them, `results` reads them. `progress` reports on it,
+  and ends it on Ctrl-C.
 
 To add a way of stepping, give it a method of `function.BlockFunction` and a name in `STEPPERS`.
 """

@@ -5,9 +5,13 @@ Elsewhere plain lines, and nothing if quiet.
 
 from __future__ import annotations
 
+import signal
+import sys
+import threading
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -182,3 +186,32 @@ class Reporter:
         """Failures so far by reason."""
         parts = [f"{n} {status.REASONS[code]}" for code, n in self.failures.most_common()]
         return "; ".join(parts) or "all ok"
+
+
+@contextmanager
+def interrupts() -> Iterator[threading.Event]:
+    """An event that Ctrl-C or SIGTERM sets; a second one ends the process at once.
+
+    SIGTERM is what batch systems send some time before they end a job.
+    """
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    before: dict[int, Any] = {}
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler or signal.SIG_DFL)
+
+    def ask(*_: object) -> None:
+        stop.set()
+        restore()
+        print("studies: stopping after what is under way; Ctrl-C again: at once", file=sys.stderr)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        before[number] = signal.signal(number, ask)
+    try:
+        yield stop
+    finally:
+        restore()

@@ -24,7 +24,6 @@ from studies.engine.folder import (
 )
 from studies.engine.progress import Phases
 from studies.engine.runs import resolved_study
-from studies.engine.sweep import run_sweep, sweep_phases
 from studies.errors import field_error
 from studies.laws import plots
 from studies.laws.candidates import drive_candidates, law_candidates
@@ -48,6 +47,7 @@ from studies.space.spec import SweepSpec
 from studies.study.spec import Study
 from studies.study.template import study_template
 from studies.study.window import with_window
+from studies.sweeps.run import run_sweep, sweep_phases
 from studies.threads import COMPILING
 
 DOCUMENT, TUNING, RUNS = "laws.json", "tuning", "runs"

@@ -2,7 +2,8 @@
 
 A sweep keeps every case; a screen keeps what is worth keeping. Its designs are made shard by shard
 (`shards`), each shard is reduced to a tally (`tally`): the best designs, how the others ended, and
-how the metric is distributed. Tallies of any shards merge, in any order, here or on a cluster
-(`run`). One file holds the tally so far (`stored`), so that a screen takes no more memory or disk
-for more designs, and goes on after any interruption.
+how the metric is distributed. Tallies of any shards merge, in any order, whether shards run here
+(`local`) or on a cluster (`workers`); `run` drives them. One file holds the tally so far
+(`stored`), so that a screen takes no more memory or disk for more designs, and goes on after any
+interruption.
 """

@@ -6,7 +6,7 @@ import sys
 from enum import StrEnum
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -17,19 +17,10 @@ from studies.cluster.connect import (
     Scheduler,
     Workers,
     WorkerTimeout,
-    on_workers,
 )
 from studies.config import start
 from studies.publish import REPORT, announce
 from studies.study.margin import ENOUGH
-
-if TYPE_CHECKING:
-    from distributed import Client
-
-    from studies.screen.run import Screener
-
-#: From so many designs on, workers of this machine are worth their start.
-LARGE = 10**6
 
 
 class Fidelity(StrEnum):
@@ -95,15 +86,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             f"{workers.options}"
         )
 
-        def make(client: Client) -> Screener:
-            from studies.screen.workers import ClusterScreener
-
-            return ClusterScreener(client, worker_timeout)
-
         with resumable(out, again), Phases(console, PHASES, quiet) as phases:
-            workers = workers.with_default(asked.n_designs >= LARGE, phases.say)
-            with on_workers(workers, phases.say, make) as screener:
-                done = run_screen(asked, out, screener=screener, phases=phases)
+            done = run_screen(asked, out, workers=workers, phases=phases)
             if not done.is_interrupted:
                 phases.begin("report")
                 write_screen_report(out, done)

@@ -4,106 +4,31 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
 
 from jaxmodel import status
 from studies import config
+from studies.cluster.connect import Place, on_workers
 from studies.engine.fidelity import TRIED, Agreement, agreement
 from studies.engine.folder import locked_folder
-from studies.engine.progress import Phases, duration_text
-from studies.engine.sweep import interrupts
+from studies.engine.progress import Phases, duration_text, interrupts
+from studies.screen.local import LocalScreener, Screener, ScreenProgress, ShardWork
 from studies.screen.selection import Selection, select, uncontrolled
-from studies.screen.shards import ScreenRequest, designs_table, shard_tally, table_of
+from studies.screen.shards import ScreenRequest, designs_table
 from studies.screen.stored import begin, write_best, write_tally
 from studies.screen.tally import LEFT_OUT, Tally, merged
+from studies.screen.workers import ClusterScreener
 from studies.show.units import count_text
-from studies.space.table import CaseTable
 from studies.study.labels import remedy
 
-T = TypeVar("T")
+#: From so many designs on, workers of this machine are worth their start.
+LARGE = 10**6
 
 PHASES = ("screen", "margins", "report")
-
-
-class ScreenProgress:
-    """Counts designs and reports them.
-
-    phases: of the command; total: designs; done: those of earlier runs.
-    """
-
-    def __init__(self, phases: Phases, total: int, done: int) -> None:
-        self.say, self._phases = phases.say, phases
-        self._total, self._done, self._before = total, done, done
-        self._began, self._next, self._n_failed = time.perf_counter(), 0.0, 0
-
-    def add(self, endings: np.ndarray) -> None:
-        """Some designs are done; how many have each status code, or were left out."""
-        self._done += int(endings.sum())
-        self._n_failed += int(endings[:LEFT_OUT].sum() - endings[status.OK])
-        elapsed = time.perf_counter() - self._began
-        if elapsed < self._next and self._done < self._total:
-            return
-        self._next = max(elapsed + 1, 1.02 * elapsed)
-        rate = (self._done - self._before) / max(elapsed, 1e-9)
-        left = duration_text((self._total - self._done) / rate) if rate else ""
-        text = (
-            f"{self._done:,} of {self._total:,} designs, {rate:,.0f}/s, {self._n_failed:,} not ok"
-        )
-        self._phases.advance(self._done, self._total, text, left and f"about {left}")
-
-
-class ShardWork(NamedTuple):
-    """Shards to run."""
-
-    screen: ScreenRequest
-    shards: Iterable[int]  # their numbers
-    progress: ScreenProgress  # told of designs that have run
-    stop: threading.Event  # once set, no further shards are begun
-
-
-class Screener(Protocol):
-    """Where shards are run."""
-
-    def tallies(self, work: ShardWork) -> Iterator[tuple[int, Tally | str]]:
-        """Each shard with its tally, or with the reason why it was given up."""
-        ...
-
-
-class LocalScreener:
-    """Runs shards in this process, and makes the designs of the next one meanwhile."""
-
-    def tallies(self, work: ShardWork) -> Iterator[tuple[int, Tally | str]]:
-        """As the protocol says."""
-        screen = work.screen
-
-        def make(shard: int) -> tuple[int, CaseTable]:
-            return shard, table_of(screen, shard)
-
-        with ThreadPoolExecutor(1) as pool:
-            for shard, table in _one_ahead(pool, make, work.shards):
-                tally = shard_tally(screen, shard, table, work.stop, work.progress.add)
-                if tally is None:
-                    return
-                yield shard, tally
-
-
-def _one_ahead(
-    pool: ThreadPoolExecutor, make: Callable[[int], T], numbers: Iterable[int]
-) -> Iterator[T]:
-    """What is made of numbers, the next one of which is being made meanwhile."""
-    coming: Future[T] | None = None
-    for number in numbers:
-        ready, coming = coming, pool.submit(make, number)
-        if ready is not None:
-            yield ready.result()
-    if coming is not None:
-        yield coming.result()
 
 
 class ScreenOutcome(NamedTuple):
@@ -128,8 +53,9 @@ def run_screen(
     screen: ScreenRequest,
     out: str | Path,
     is_quiet: bool = False,
-    screener: Screener | None = None,
+    workers: Place = None,
     phases: Phases | None = None,
+    screener: Screener | None = None,
 ) -> ScreenOutcome:
     """Run what is left of a screen into a folder.
 
@@ -137,8 +63,9 @@ def run_screen(
         screen: from `screen_of`.
         out: its folder; one that was begun is gone on with.
         is_quiet: hide progress.
-        screener: where shards are run; default: here.
+        workers: as in `run_sweep`.
         phases: of a longer command, with those of `PHASES`, in place of is_quiet.
+        screener: of the shards, in place of workers.
 
     Returns:
         ScreenOutcome; `best.toml` is there unless the run was interrupted or nothing is kept.
@@ -147,10 +74,19 @@ def run_screen(
         StudyError: a fault of the sweep, the folder or the disk. Finished shards stay.
     """
     config.require_configured()
-    screener, out = screener or LocalScreener(), Path(out)
     if phases is None:
         with Phases(Console(highlight=False, markup=False), PHASES, is_quiet) as phases:
-            return run_screen(screen, out, screener=screener, phases=phases)
+            return run_screen(screen, out, False, workers, phases, screener)
+    if screener is not None:
+        return _run_rest(screen, Path(out), screener, phases)
+    is_large = screen.n_designs >= LARGE
+    with on_workers(workers, is_large, phases.say, ClusterScreener) as found:
+        return _run_rest(screen, Path(out), found or LocalScreener(), phases)
+
+
+def _run_rest(
+    screen: ScreenRequest, out: Path, screener: Screener, phases: Phases
+) -> ScreenOutcome:
     lost: dict[int, str] = {}
     with locked_folder(out, "screen"), interrupts() as stop:
         is_done, tally = begin(out, screen)

@@ -13,7 +13,7 @@ from studies import config
 from studies.cluster.runner import answers
 from studies.cluster.watch import Watch, wait_for_workers
 from studies.cluster.worker import identity, working
-from studies.screen.run import ShardWork
+from studies.screen.local import ShardWork
 from studies.screen.shards import ScreenRequest, screen_of, shard_tally, table_of
 from studies.screen.tally import Tally
 from studies.space.spec import parse_sweep
@@ -42,7 +42,7 @@ class ShardDone(NamedTuple):
 
 
 class ClusterScreener:
-    """Runs shards on a cluster; a `studies.screen.run.Screener`."""
+    """Runs shards on a cluster; a `studies.screen.local.Screener`."""
 
     def __init__(self, client: Client, timeout: float) -> None:
         """

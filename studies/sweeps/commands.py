@@ -17,7 +17,6 @@ from studies.cluster.connect import (
     Scheduler,
     Workers,
     WorkerTimeout,
-    runner_for,
 )
 from studies.config import start
 from studies.errors import StudyError
@@ -38,9 +37,6 @@ Tolerance: TypeAlias = Annotated[
     ),
 ]
 Folder = Annotated[Path, typer.Argument(help="folder of a sweep")]
-
-#: From so many cases on, workers of this machine are worth their start.
-LARGE = 50_000
 
 
 def _read(folder: Path) -> SweepData:
@@ -92,10 +88,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             refuse_existing(out, SWEEPS, resume)
         start(precision, gpu=not workers.are_named)
         from studies.engine.progress import Phases, duration_text
-        from studies.engine.sweep import make_plan, run_sweep, sweep_phases
-        from studies.space.designs import design_of
         from studies.space.spec import load_sweep
         from studies.sweeps.dry_run import plan_document, print_plan
+        from studies.sweeps.run import make_plan, run_sweep, sweep_phases
 
         sweep_spec = load_sweep(spec)
         if dry_run and workers.are_named:
@@ -115,11 +110,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
         names = (*sweep_phases(sweep_spec), *(["report"] if report else []))
         with Phases(console, names, quiet) as phases:
-            design = design_of(sweep_spec.root, sweep_spec.study, sweep_spec.sweep.seed)
-            is_large = design.size * sweep_spec.sweep.repeats >= LARGE
-            workers = workers.with_default(is_large, phases.say)
-            with runner_for(sweep_spec, workers, phases.say) as runner:
-                done = run_sweep(sweep_spec, out, resume, runner=runner, phases=phases)
+            done = run_sweep(sweep_spec, out, resume, workers=workers, phases=phases)
             if report and not done.is_interrupted:
                 from studies.sweeps.report import write_sweep_report
 

@@ -14,7 +14,6 @@ from studies.engine.plan import local_layout
 from studies.engine.preflight import check_run
 from studies.engine.progress import duration_text
 from studies.engine.stored import chunk_arrays
-from studies.engine.sweep import Plan
 from studies.errors import StudyError
 from studies.show.listing import Rows, print_rows
 from studies.show.units import count_text
@@ -22,6 +21,7 @@ from studies.space.table import CaseTable, case_study
 from studies.study.fields import idle_axes
 from studies.study.paths import field_unit, parse_entry
 from studies.sweeps.records import Record
+from studies.sweeps.run import Plan
 from studies.sweeps.show import short_value
 
 #: Cases of each program that are run to measure how long all of them take.

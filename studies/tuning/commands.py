@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,17 +16,11 @@ from studies.cluster.connect import (
     Scheduler,
     Workers,
     WorkerTimeout,
-    on_workers,
 )
 from studies.config import start
 from studies.errors import StudyError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from distributed import Client
-
-    from studies.tuning.evaluate import Evaluator
     from studies.tuning.spec import TuneSpec
 
 
@@ -80,31 +73,13 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if out is None:
             raise StudyError("--out: name a folder for the results")
 
-        def notify(text: str) -> None:
-            if not quiet:
-                console.print(text, soft_wrap=True)
-
-        with _evaluator_for(tuning, workers, notify) as evaluator:
-            run_tuning(tuning, out, resume, console, quiet, evaluator)
+        run_tuning(tuning, out, resume, console, quiet, workers)
         announce(console, out / REPORT, "; tuned studies in the same folder")
         if explore:
             from studies.explorer.page import write_explorer
             from studies.tuning.explore import explore_tuning
 
             write_explorer(out, explore_tuning, console, quiet)
-
-
-def _evaluator_for(
-    spec: TuneSpec, workers: Workers, notify: Callable[[str], None]
-) -> AbstractContextManager[Evaluator | None]:
-    """The evaluator of a tuning's designs on workers, None for this process."""
-
-    def make(client: Client) -> Evaluator:
-        from studies.tuning.workers import ClusterEvaluator
-
-        return ClusterEvaluator(client, spec, workers.timeout, notify)
-
-    return on_workers(workers, notify, make)
 
 
 def _audit(spec: TuneSpec, console: Console) -> None:

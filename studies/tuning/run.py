@@ -16,6 +16,7 @@ import numpy as np
 from rich.console import Console
 
 from studies import config
+from studies.cluster.connect import Place, on_workers
 from studies.engine.folder import make_manifest
 from studies.engine.progress import Phases, duration_text
 from studies.engine.run_data import run_attributes
@@ -47,10 +48,13 @@ from studies.tuning.report import (
 )
 from studies.tuning.results import variables
 from studies.tuning.spec import TuneSpec
+from studies.tuning.workers import ClusterEvaluator
 
-#: Modules that determine the numbers of a tuning, with everything they import.
+#: From so many differentiated runs an iteration on, workers of this machine are worth their start.
+LARGE = 64
 #: Share of the evaluations of a descent that the comparison of its derivatives takes.
 SHARE = 0.1
+#: Modules that determine the numbers of a tuning, with everything they import.
 DECISIVE = ("studies.tuning.check", "studies.tuning.evaluate", "studies.tuning.optimise")
 
 
@@ -65,6 +69,7 @@ def run_tuning(
     is_resumed: bool = False,
     console: Console | None = None,
     is_quiet: bool = False,
+    workers: Place = None,
     evaluator: Evaluator | None = None,
 ) -> TuneFindings:
     """Tune, check the result on fresh scenarios, and write it.
@@ -75,7 +80,8 @@ def run_tuning(
         is_resumed: continue the existing tuning.
         console: where progress goes; default: standard output.
         is_quiet: hide progress.
-        evaluator: what evaluates all starting points; default: this process, as `make_evaluator`.
+        workers: as in `run_sweep`.
+        evaluator: of all starting points, in place of workers.
 
     Returns:
         What was found.
@@ -88,12 +94,19 @@ def run_tuning(
     out = Path(out)
     console = console or Console(highlight=False, markup=False)
     manifest = make_manifest(spec.data, DECISIVE)
+    n_runs = len(start_families(spec)) * spec.tune.scenarios.count * len(spec.moves)
+    is_large = evaluator is None and n_runs >= LARGE
 
-    with open_tuning(out, manifest, is_resumed) as before:
+    phases = Phases(console, tune_phases(spec), is_quiet)
+    remote = partial(ClusterEvaluator, spec, phases.say)
+    with (
+        phases,
+        on_workers(workers, is_large, phases.say, remote) as found,
+        open_tuning(out, manifest, is_resumed) as before,
+    ):
         if before is not None and not is_compatible(spec, before):
             raise StudyError(f"{out / PROGRESS}: damaged; name a new folder")
-        with Phases(console, tune_phases(spec), is_quiet) as phases:
-            findings = _tune(spec, out, before, evaluator, phases)
+        findings = _tune(spec, out, before, evaluator or found, phases)
     faults = violated_limits(spec, findings.at)
     if faults:
         raise StudyError("tune.limits: not satisfied together; " + "; ".join(faults))

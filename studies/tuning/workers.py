@@ -8,11 +8,10 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from distributed import get_worker
 
 from studies import config
 from studies.cluster.watch import Watch
-from studies.cluster.worker import alone, configure_worker, identity, refuse_difference
+from studies.cluster.worker import identity, working
 from studies.errors import StudyError
 from studies.tuning.evaluate import Evaluation, Evaluator
 from studies.tuning.optimise import start_families
@@ -48,10 +47,7 @@ def evaluate_part(part: Share) -> ShareDone:
     Raises:
         StudyError: the worker has other versions than the client; a fault of the tuning.
     """
-    with alone:
-        worker = get_worker()
-        refuse_difference(part.identity, worker)
-        configure_worker(part.precision, worker)
+    with working(part.identity, part.precision) as worker:
         evaluator = _evaluator(part.precision, part.spec, part.families)
         return ShareDone(evaluator.evaluate(part.values, part.needs_gradient), worker.address)
 
@@ -66,14 +62,14 @@ class ClusterEvaluator(Evaluator):
     """The same designs in the same order, evaluated in parts by the currently available workers."""
 
     def __init__(
-        self, client: Client, spec: TuneSpec, timeout: float, notify: Callable[[str], None]
+        self, spec: TuneSpec, notify: Callable[[str], None], client: Client, timeout: float
     ) -> None:
         """
         Args:
-            client: from `connected`.
             spec: the tuning.
-            timeout: a worker that stays busy for longer without answering is restarted [s].
             notify: called with what users should know.
+            client: from `connected`.
+            timeout: a worker that stays busy for longer without answering is restarted [s].
         """
         families = start_families(spec)
         super().__init__(spec, [spec.moving[k] for k in families])

@@ -20,7 +20,6 @@ from studies.engine.preflight import check_run
 from studies.engine.results import SweepData, metric_values, read_sweep
 from studies.engine.runs import run_study
 from studies.engine.stability import loop_report
-from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.reference import lagrangian as reference
 from studies.show.figures import styled
@@ -34,6 +33,7 @@ from studies.study.spec import load_study
 from studies.study.template import study_template
 from studies.sweeps.dry_run import axis_rows
 from studies.sweeps.plots import plot
+from studies.sweeps.run import run_sweep
 from studies.sweeps.show import select
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import parse_tuning

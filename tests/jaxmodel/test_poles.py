@@ -21,12 +21,12 @@ from studies.engine.poles import PoleReport, _matched, _relative_distance, diffe
 from studies.engine.results import read_sweep
 from studies.engine.runs import run_study
 from studies.engine.stability import loop_report
-from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table, case_study
 from studies.study.cases import as_arrays, build_case
 from studies.study.spec import Study
+from studies.sweeps.run import run_sweep
 from tests.bare import parse_study
 from tests.jaxmodel.kept import bases_of, design_of, nominal_of, prepared
 from tests.jaxmodel.kept import without_run as arrays

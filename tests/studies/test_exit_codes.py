@@ -15,16 +15,15 @@ from jaxmodel import status
 from studies.cluster import runner as cluster_runner
 from studies.cluster.runner import AHEAD, ClusterRunner
 from studies.cluster.worker import ChunkDone
-from studies.engine import sweep as engine_sweep
 from studies.engine.chunks import Done, Lost
 from studies.engine.plan import Layout, plan_groups
 from studies.engine.progress import Phases, Reporter
 from studies.engine.results import read_sweep
-from studies.engine.sweep import Outcome
 from studies.single import run as single_run
 from studies.space.table import build_table
 from studies.spillover import run as spillover_run
-from studies.sweeps import commands as sweep_commands
+from studies.sweeps import run as sweep_run
+from studies.sweeps.run import Outcome
 from studies.tuning import audit as audit_module
 from studies.tuning.audit import ALLOWED, Disagreement, audit
 from tests.canonical import TINY, text_of
@@ -70,7 +69,7 @@ def test_a_sweep_with_lost_cases_fails_and_says_how_to_retry(
     def losing(*_):
         yield Losing()
 
-    monkeypatch.setattr(sweep_commands, "runner_for", losing)
+    monkeypatch.setattr(sweep_run, "on_workers", losing)
     out = tmp_path / "out"
     code, text, err = run(capsys, "sweep", sweep_file, "--out", out)
     assert code == 1
@@ -100,7 +99,7 @@ def test_how_a_sweep_ended(capsys, monkeypatch, sweep_file, tmp_path, lost, is_i
             lost=np.arange(lost),
         )
 
-    monkeypatch.setattr(engine_sweep, "run_sweep", ended)
+    monkeypatch.setattr(sweep_run, "run_sweep", ended)
     out = tmp_path / "out"
     code, text, err = run(capsys, "sweep", sweep_file, "--out", out)
     assert code == wanted
@@ -167,7 +166,7 @@ def on_cluster(monkeypatch):
     def outcome(answers, **options):
         fake = FakeCluster(answers, **options)
         monkeypatch.setattr(cluster_runner, "Watch", lambda *_: fake)
-        runner = ClusterRunner(fake, spec, 60.0)
+        runner = ClusterRunner(spec, fake, 60.0)
         reporter = Reporter(Phases(SILENT, ("compile", "run"), True), "run", 20)
         found = list(runner.run(table, groups, reporter, threading.Event()))
         return fake, found

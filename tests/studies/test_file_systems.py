@@ -8,12 +8,12 @@ import tempfile
 
 import pytest
 
-from studies.engine import sweep as sweeps
 from studies.engine.folder import BASELINE, LOCK, locked_folder
-from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.publish import working_folder
 from studies.store import write_store
+from studies.sweeps import run as sweeps
+from studies.sweeps.run import run_sweep
 from tests.studies.test_exit_codes import Losing
 from tests.sweeps import small_spec
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-import studies.engine.sweep as engine_sweep
+import studies.sweeps.run as sweep_run
 from studies.cli import main
 from studies.engine.folder import locked_folder, make_manifest, open_folder
 from studies.errors import StudyError
@@ -90,7 +90,7 @@ def test_files_in_the_way_are_refused_before_jax_starts(
 
 
 def test_a_sweep_is_not_expanded_for_a_folder_that_is_taken(tmp_path, monkeypatch):
-    monkeypatch.setattr(engine_sweep, "build_table", forbidden)
+    monkeypatch.setattr(sweep_run, "build_table", forbidden)
     (tmp_path / "sweep.json").write_text("{}")
     with pytest.raises(StudyError, match="holds a sweep already; add --resume"):
-        engine_sweep.run_sweep(small_spec(), tmp_path)
+        sweep_run.run_sweep(small_spec(), tmp_path)

@@ -31,7 +31,7 @@ if variation == "narrow vectors":
     narrow = native.this_processor().without("avx512")
     native.this_processor = lambda: narrow
 from studies.engine.results import read_sweep
-from studies.engine.sweep import run_sweep
+from studies.sweeps.run import run_sweep
 spec = parse_sweep({
     "run": {"duration": 0.025, "seed": 3},
     "link": {"modes": 3},

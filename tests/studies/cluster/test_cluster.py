@@ -6,7 +6,7 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from itertools import islice
 from types import SimpleNamespace
 
@@ -18,7 +18,7 @@ from distributed.comm.core import CommClosedError
 from rich.console import Console
 
 from studies.cluster import connect
-from studies.cluster.connect import Workers, connected
+from studies.cluster.connect import Workers, connected, on_workers
 from studies.cluster.runner import ClusterRunner
 from studies.cluster.worker import difference, identity
 from studies.engine import plan
@@ -27,11 +27,12 @@ from studies.engine.columns import NOT_RUN
 from studies.engine.folder import CHUNKS, SweepFolder, finished_cases, read_manifest
 from studies.engine.progress import Phases
 from studies.engine.results import read_sweep
-from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
-from studies.screen.run import PHASES, ScreenProgress, ShardWork, run_screen
+from studies.screen.local import ScreenProgress, ShardWork
+from studies.screen.run import PHASES, run_screen
 from studies.screen.shards import screen_of, table_of
 from studies.screen.workers import ClusterScreener
+from studies.sweeps.run import run_sweep
 from studies.tuning.run import make_evaluator
 from studies.tuning.workers import ClusterEvaluator
 from tests.clusters import judged, machines
@@ -78,8 +79,8 @@ def local(tmp_path_factory):
 def told(cluster, out, *more, timeout=60.0):
     """Run the sweep on the cluster; the outcome and what was said."""
     console = Console(record=True, width=200, file=open(os.devnull, "w"))  # noqa: SIM115
-    runner = ClusterRunner(cluster.client, SPEC, timeout)
-    outcome = run_sweep(SPEC, out, *more, console=console, runner=runner)
+    workers = Workers(str(cluster.scheduler), timeout=timeout)
+    outcome = run_sweep(SPEC, out, *more, console=console, workers=workers)
     return outcome, console.export_text()
 
 
@@ -131,7 +132,7 @@ def test_workers_do_not_mix_up_sweeps(cluster, tmp_path):
         spec = small_spec(drive={"kp": kp})
         here, there = tmp_path / f"here{kp:g}", tmp_path / f"there{kp:g}"
         run_sweep(spec, here, is_quiet=True)
-        runner = ClusterRunner(cluster.client, spec, 60.0)
+        runner = ClusterRunner(spec, cluster.client, 60.0)
         run_sweep(spec, there, is_quiet=True, runner=runner)
         assert_same(arrays(here), arrays(there), 1e-12)
 
@@ -144,7 +145,7 @@ def test_from_here_to_the_cluster_and_back(cluster, local, tmp_path):
     out = tmp_path / "out"
     run_sweep(HALF, out, is_quiet=True)
     with pytest.raises(StudyError, match="disappeared"):
-        run_sweep(SPEC, out, True, is_quiet=True, runner=Stopped(cluster.client, SPEC, 60.0))
+        run_sweep(SPEC, out, True, is_quiet=True, runner=Stopped(SPEC, cluster.client, 60.0))
     assert len(list((out / CHUNKS).glob("*.h5"))) == 2
     done = len(finished_cases(out).case_id)
     assert CASES / 2 < done < CASES
@@ -166,7 +167,7 @@ def test_a_full_disk_leaves_nothing_under_way(cluster, tmp_path, monkeypatch):
 
     closed = []
     monkeypatch.setattr(SweepFolder, "write_chunk", write)
-    runner = Closed(cluster.client, SPEC, 60.0)
+    runner = Closed(SPEC, cluster.client, 60.0)
     with pytest.raises(StudyError, match="no space") as raised:
         run_sweep(SPEC, tmp_path / "out", is_quiet=True, runner=runner)
     assert closed and raised.tb  # which keeps the frames: it is no matter of collecting garbage
@@ -231,7 +232,7 @@ def test_a_scheduler_that_goes_is_said(cluster):
 def test_a_tuning_has_the_same_slopes(cluster):
     spec = tuning(GAIN, starts=3)
     here = make_evaluator(spec)
-    there = ClusterEvaluator(cluster.client, spec, 60.0, lambda text: None)
+    there = ClusterEvaluator(spec, lambda text: None, cluster.client, 60.0)
     values = spec.free.values(np.array([[0.2], [0.5], [0.8]]))
     wanted, found = here.evaluate(values), there.evaluate(values)
     for name, x, y in zip(wanted._fields, wanted, found, strict=True):
@@ -244,16 +245,16 @@ def test_a_script_that_its_workers_would_run_again_is_told_so(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
         "import studies\n"
-        "from studies.cluster.connect import Workers, connected\n"
         "studies.configure()\n"
-        "with connected(Workers(None, 1, 600.0), print):\n"
-        "    print('connected')\n"
+        "studies.run_sweep('placement', 'out', is_quiet=True, workers=1)\n"
     )
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=120)
+    command = [sys.executable, script]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert not (tmp_path / "out").exists()
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.count("Traceback") == 1
     assert done.stderr.endswith(
-        f"workers do not start (they import {script}: put what it does under "
+        f"workers do not start (workers import {script}: put what it does under "
         'if __name__ == "__main__":)\n'
     )
 
@@ -287,6 +288,34 @@ def test_much_work_uses_many_cores_without_being_asked(monkeypatch, cores, is_la
     monkeypatch.setattr(connect, "find_spec", lambda name: None)
     assert named.with_default(is_large, lines.append) == named
     assert all("[cluster]" in line for line in lines[1:])
+    monkeypatch.undo()
+    monkeypatch.setattr(connect, "usable_cores", lambda: cores)
+    monkeypatch.setattr(connect, "_unguarded", lambda: "workers import it")
+    assert named.with_default(is_large, lines.append) == named
+    assert all("workers import it" in line for line in lines[2:])
+
+
+@pytest.mark.parametrize(
+    ("place", "named"),
+    [
+        (None, Workers()),
+        (2, Workers(local=2)),
+        ("tcp://127.0.0.1:1", Workers("tcp://127.0.0.1:1")),
+        (Workers(local=1, timeout=9.0), Workers(local=1, timeout=9.0)),
+    ],
+)
+def test_workers_are_named_in_python_too(monkeypatch, place, named):
+    asked = []
+
+    @contextmanager
+    def seen(workers, say):
+        asked.append(workers)
+        yield "client"
+
+    monkeypatch.setattr(connect, "connected", seen)
+    with on_workers(place, False, print, lambda client, timeout: (client, timeout)) as found:
+        assert found == (("client", named.timeout) if named.are_named else None)
+    assert asked == [named] * named.are_named
 
 
 @pytest.mark.parametrize(
@@ -386,7 +415,7 @@ def test_overhead_and_scaling(tmp_path, monkeypatch):
             (tmp_path / name).mkdir()
             options = {"workers": workers, "threads": threads, "is_small": False}
             group = stack.enter_context(machines(tmp_path / name, **options))
-            found[name] = ClusterRunner(group.client, spec, 600.0)
+            found[name] = ClusterRunner(spec, group.client, 600.0)
         times = {name: [] for name in found}
         for k in range(5):
             for name, runner in found.items():

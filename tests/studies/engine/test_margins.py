@@ -30,9 +30,9 @@ from studies.engine.margins import judge_loops
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.results import read_sweep
 from studies.engine.stability import loop_report, with_margin_modes
-from studies.engine.sweep import run_sweep
 from studies.space.table import build_table
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure
+from studies.sweeps.run import run_sweep
 from studies.sweeps.show import ranked_cases
 from tests.bare import parse_sweep
 from tests.canonical import MACHINE, study_of

@@ -16,7 +16,6 @@ from campaigns.mutations import sweep_folder
 from jaxmodel.loop_figures import MARGINS
 from studies.engine import baseline, results
 from studies.engine import folder as folders
-from studies.engine import sweep as run_module
 from studies.engine.folder import (
     BASELINE,
     CHUNKS,
@@ -29,12 +28,13 @@ from studies.engine.folder import (
     open_folder,
 )
 from studies.engine.results import DIGEST, baseline_digest, baseline_id, read_sweep
-from studies.engine.sweep import case_content, make_plan, run_sweep
 from studies.errors import StudyError
 from studies.publish import publish, replacing
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table
 from studies.store import Variable, write_store
+from studies.sweeps import run as run_module
+from studies.sweeps.run import case_content, make_plan, run_sweep
 from studies.tuning.folder import open_tuning
 from tests import TOP
 from tests.bare import bare

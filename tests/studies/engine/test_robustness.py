@@ -33,9 +33,9 @@ from studies.engine.robustness import (
     response_and_modes,
 )
 from studies.engine.stability import _loops, with_margin_modes
-from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure
+from studies.sweeps.run import run_sweep
 from studies.sweeps.show import ranked_cases
 from studies.tuning import loop_figures
 from studies.tuning.check import tuned_study

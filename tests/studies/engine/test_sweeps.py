@@ -23,7 +23,6 @@ import studies
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
 from studies.engine import chunks, function, plan
-from studies.engine import sweep as run_module
 from studies.engine.design import deviations, load_design
 from studies.engine.folder import (
     CHUNKS,
@@ -36,10 +35,11 @@ from studies.engine.function import TRACES
 from studies.engine.margins import no_margins
 from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import run_study
-from studies.engine.sweep import make_plan, run_sweep
 from studies.errors import StudyError
 from studies.space.table import build_table
 from studies.study.cases import build_structure
+from studies.sweeps import run as run_module
+from studies.sweeps.run import make_plan, run_sweep
 from studies.sweeps.show import case_rows, margin_warning, ranked_cases
 from tests import TOP
 from tests.sweeps import FAST_MOVE, HOME_PHI, MIXED, narrow_blocks, small, small_spec
@@ -315,7 +315,7 @@ studies.configure()
 studies.config.keep_programs()
 from pathlib import Path
 from studies.engine import plan
-from studies.engine.sweep import run_sweep
+from studies.sweeps.run import run_sweep
 from studies.space.spec import parse_sweep
 plan.LANES, plan.LARGEST_CHUNK = 8, 16
 run_sweep(parse_sweep(json.loads(sys.argv[1])), Path(sys.argv[2]))
@@ -380,7 +380,7 @@ def test_a_chunk_outlives_a_loss_of_power(tmp_path, monkeypatch):
 def partly_done(out, spec=None, number=signal.SIGINT):
     """A sweep that stopped after two chunks, as Ctrl-C leaves it."""
     spec = spec or noisy_spec()
-    from studies.engine import sweep as module
+    from studies.sweeps import run as module
 
     original, count = module.SweepFolder.write_chunk, [0]
 

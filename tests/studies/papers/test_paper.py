@@ -20,7 +20,6 @@ from studies.atlas import atlas_sweep, read_subsets
 from studies.cli import main
 from studies.engine.preflight import check_run
 from studies.engine.runs import run_study
-from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.papers import run as papers
 from studies.papers.zhang_2016 import card as paper
@@ -38,6 +37,7 @@ from studies.show.units import span
 from studies.store import read_store
 from studies.study.labels import describe
 from studies.study.printed import TABLE_1
+from studies.sweeps.run import run_sweep
 from tests.bare import paper_study
 from tests.pages import text_of
 

@@ -18,11 +18,11 @@ from studies.cli import main
 from studies.engine.fidelity import Agreement
 from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import run_uncontrolled
-from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.screen import report, selection, shards
+from studies.screen.local import LocalScreener
 from studies.screen.report import margin_rows, quantile_rows, summary_lines, write_screen_report
-from studies.screen.run import LocalScreener, run_screen
+from studies.screen.run import run_screen
 from studies.screen.selection import select
 from studies.screen.shards import axis_columns, screen_of
 from studies.screen.stored import BEST, TALLY, best_sweep, read_tally, write_tally
@@ -38,6 +38,7 @@ from studies.screen.tally import (
 from studies.space.spec import load_sweep
 from studies.space.table import build_table
 from studies.store import Variable, read_store, write_store
+from studies.sweeps.run import run_sweep
 from tests.bare import parse_sweep
 from tests.pages import text_of
 from tests.sweeps import narrow_blocks, small, small_spec

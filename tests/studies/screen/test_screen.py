@@ -11,11 +11,11 @@ from studies.engine.executor import Executor
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import _simulate
-from studies.engine.sweep import make_plan, run_sweep
 from studies.errors import StudyError
 from studies.space.table import build_table
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.sweeps.report import report, write_sweep_report
+from studies.sweeps.run import make_plan, run_sweep
 from studies.sweeps.screening import _rank_correlation, check_screen
 from studies.sweeps.show import ranked_cases, recommended
 from tests.bare import paper_study, parse_sweep

@@ -8,12 +8,12 @@ import pytest
 from jaxmodel.laws import LAWS
 from jaxmodel.shaper import SHAPERS
 from studies.engine.results import read_sweep
-from studies.engine.sweep import run_sweep
 from studies.space import table as tables
 from studies.space.table import build_table, designs
 from studies.study.fields import _LAWS, _RULES, idle_axes
 from studies.study.spec import Study
 from studies.sweeps.dry_run import axis_records
+from studies.sweeps.run import run_sweep
 from tests.canonical import MACHINE
 from tests.studies.test_cli import run
 from tests.sweeps import narrow_blocks, small_spec

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from studies.engine.results import read_sweep
-from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.space.methods import morris_points, saltelli_points
 from studies.space.spec import load_sweep
@@ -17,6 +16,7 @@ from studies.space.table import build_table, case_study
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure, case_of
 from studies.study.fields import Fields, padded
 from studies.study.numbers import study_numbers
+from studies.sweeps.run import run_sweep
 from tests.bare import parse_sweep
 from tests.canonical import MACHINE
 from tests.sweeps import BASE, MIXED, small, small_spec

@@ -18,7 +18,6 @@ from jaxmodel.metrics import METRICS
 from studies.engine import design, results
 from studies.engine.columns import axis_variables, case_variables, label_of
 from studies.engine.results import SweepData, metric_values
-from studies.engine.sweep import make_plan
 from studies.errors import ResolutionWarning, StudyError
 from studies.show.listing import Rows, print_rows
 from studies.single.run import Replay
@@ -32,6 +31,7 @@ from studies.sweeps.environments import environments_text
 from studies.sweeps.explore import _figure
 from studies.sweeps.plots import _scale_ordinate, front
 from studies.sweeps.report import report
+from studies.sweeps.run import make_plan
 from studies.sweeps.screening import check_screen, draw_screen
 from studies.sweeps.sensitivity import analyse, failure_causes
 from studies.sweeps.show import (

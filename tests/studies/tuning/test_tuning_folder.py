@@ -13,7 +13,6 @@ from scipy.stats import spearmanr
 from studies import cli
 from studies.engine.results import read_sweep
 from studies.engine.runs import run_study
-from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.explore import explore_results
 from studies.space.spec import parse_sweep
@@ -21,6 +20,7 @@ from studies.store import read_store
 from studies.study import spec as spec_module
 from studies.study.files import read_toml
 from studies.study.spec import load_study
+from studies.sweeps.run import run_sweep
 from studies.sweeps.show import ranked_cases
 from studies.tuning import audit as audit_module
 from studies.tuning import results

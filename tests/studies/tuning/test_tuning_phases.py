@@ -78,7 +78,7 @@ def with_phases(check=None, audit=None, write=None):
 
 def tune(out, is_resumed=False):
     spec, evaluator = known()
-    return run_tuning(spec, out, is_resumed, SILENT, True, evaluator)
+    return run_tuning(spec, out, is_resumed, SILENT, True, evaluator=evaluator)
 
 
 def interrupted(after):

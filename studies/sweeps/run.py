@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import signal
-import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +14,8 @@ from rich.console import Console
 
 from jaxmodel.case import Structure
 from studies import config
+from studies.cluster.connect import Place, on_workers
+from studies.cluster.runner import ClusterRunner
 from studies.engine.baseline import keep_baseline
 from studies.engine.chunks import Done, LocalRunner, Lost, Runner
 from studies.engine.folder import (
@@ -29,7 +29,7 @@ from studies.engine.folder import (
     open_folder,
 )
 from studies.engine.plan import Group, Layout, local_layout, plan_groups
-from studies.engine.progress import Phases, Reporter
+from studies.engine.progress import Phases, Reporter, interrupts
 from studies.engine.results import links_of
 from studies.engine.screen import (
     Round,
@@ -45,9 +45,13 @@ from studies.engine.screen import (
 from studies.engine.stored import chunk_arrays, kept_metrics, manifest_attributes, merge
 from studies.errors import StudyError
 from studies.publish import shown
+from studies.space.designs import design_of
 from studies.space.spec import READING, SELECTING, SPREADING, SweepSpec, load_sweep
 from studies.space.table import CaseTable, build_table
 from studies.study.fields import idle_axes
+
+#: From so many cases on, workers of this machine are worth their start.
+LARGE = 50_000
 
 
 def sweep_phases(spec: SweepSpec) -> tuple[str, ...]:
@@ -115,8 +119,9 @@ def run_sweep(
     is_resumed: bool = False,
     console: Console | None = None,
     is_quiet: bool = False,
-    runner: Runner | None = None,
+    workers: Place = None,
     phases: Phases | None = None,
+    runner: Runner | None = None,
 ) -> Outcome:
     """Run a sweep into a folder.
 
@@ -126,8 +131,10 @@ def run_sweep(
         is_resumed: continue or extend the existing sweep.
         console: where progress goes; default: standard output.
         is_quiet: hide progress.
-        runner: where chunks are run; default: here.
+        workers: a number of processes on this machine, or a scheduler's address or file, as
+            `--local-workers` and `--scheduler`; default: this process, for many cases all cores.
         phases: of a longer command, with those of `sweep_phases`, in place of console and is_quiet.
+        runner: of the chunks, in place of workers.
 
     Returns:
         Outcome; `results.h5` exists unless the run was interrupted.
@@ -137,11 +144,21 @@ def run_sweep(
     """
     config.require_configured()
     spec = spec if isinstance(spec, SweepSpec) else load_sweep(spec)
-    runner, out = runner or LocalRunner(), Path(out)
     if phases is None:
         console = console or Console(highlight=False, markup=False)
         with Phases(console, sweep_phases(spec), is_quiet) as phases:
-            return run_sweep(spec, out, is_resumed, runner=runner, phases=phases)
+            return run_sweep(spec, out, is_resumed, None, False, workers, phases, runner)
+    if runner is not None:
+        return _run_rest(spec, Path(out), is_resumed, runner, phases)
+    n_cases = design_of(spec.root, spec.study, spec.sweep.seed).size * spec.sweep.repeats
+    remote = partial(ClusterRunner, spec)
+    with on_workers(workers, n_cases >= LARGE, phases.say, remote) as found:
+        return _run_rest(spec, Path(out), is_resumed, found or LocalRunner(), phases)
+
+
+def _run_rest(
+    spec: SweepSpec, out: Path, is_resumed: bool, runner: Runner, phases: Phases
+) -> Outcome:
     say = partial(phases.console.print, soft_wrap=True)
     manifest = make_manifest(spec.data)
     with open_folder(out, manifest, is_resumed) as folder, interrupts() as stop:
@@ -368,32 +385,3 @@ def _check_whole(table: CaseTable, rows: np.ndarray, done: np.ndarray, out: Path
             f"{out}: chunks with {lost} of {len(rows)} cases disappeared while the sweep ran; "
             "run them again with --resume"
         )
-
-
-@contextmanager
-def interrupts() -> Iterator[threading.Event]:
-    """An event that Ctrl-C or SIGTERM sets; a second one ends the process at once.
-
-    SIGTERM is what batch systems send some time before they end a job.
-    """
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    before: dict[int, Any] = {}
-
-    def restore() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler or signal.SIG_DFL)
-
-    def ask(*_: object) -> None:
-        stop.set()
-        restore()
-        print("studies: stopping after what is under way; Ctrl-C again: at once", file=sys.stderr)
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        before[number] = signal.signal(number, ask)
-    try:
-        yield stop
-    finally:
-        restore()

@@ -1,0 +1,94 @@
+"""Shards of a screen in this process, one after the other, and how far they are."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import NamedTuple, Protocol, TypeVar
+
+import numpy as np
+
+from jaxmodel import status
+from studies.engine.progress import Phases, duration_text
+from studies.screen.shards import ScreenRequest, shard_tally, table_of
+from studies.screen.tally import LEFT_OUT, Tally
+from studies.space.table import CaseTable
+
+T = TypeVar("T")
+
+
+class ScreenProgress:
+    """Counts designs and reports them.
+
+    phases: of the command; total: designs; done: those of earlier runs.
+    """
+
+    def __init__(self, phases: Phases, total: int, done: int) -> None:
+        self.say, self._phases = phases.say, phases
+        self._total, self._done, self._before = total, done, done
+        self._began, self._next, self._n_failed = time.perf_counter(), 0.0, 0
+
+    def add(self, endings: np.ndarray) -> None:
+        """Some designs are done; how many have each status code, or were left out."""
+        self._done += int(endings.sum())
+        self._n_failed += int(endings[:LEFT_OUT].sum() - endings[status.OK])
+        elapsed = time.perf_counter() - self._began
+        if elapsed < self._next and self._done < self._total:
+            return
+        self._next = max(elapsed + 1, 1.02 * elapsed)
+        rate = (self._done - self._before) / max(elapsed, 1e-9)
+        left = duration_text((self._total - self._done) / rate) if rate else ""
+        text = (
+            f"{self._done:,} of {self._total:,} designs, {rate:,.0f}/s, {self._n_failed:,} not ok"
+        )
+        self._phases.advance(self._done, self._total, text, left and f"about {left}")
+
+
+class ShardWork(NamedTuple):
+    """Shards to run."""
+
+    screen: ScreenRequest
+    shards: Iterable[int]  # their numbers
+    progress: ScreenProgress  # told of designs that have run
+    stop: threading.Event  # once set, no further shards are begun
+
+
+class Screener(Protocol):
+    """Where shards are run."""
+
+    def tallies(self, work: ShardWork) -> Iterator[tuple[int, Tally | str]]:
+        """Each shard with its tally, or with the reason why it was given up."""
+        ...
+
+
+class LocalScreener:
+    """Runs shards in this process, and makes the designs of the next one meanwhile."""
+
+    def tallies(self, work: ShardWork) -> Iterator[tuple[int, Tally | str]]:
+        """As the protocol says."""
+        screen = work.screen
+
+        def make(shard: int) -> tuple[int, CaseTable]:
+            return shard, table_of(screen, shard)
+
+        with ThreadPoolExecutor(1) as pool:
+            for shard, table in _one_ahead(pool, make, work.shards):
+                tally = shard_tally(screen, shard, table, work.stop, work.progress.add)
+                if tally is None:
+                    return
+                yield shard, tally
+
+
+def _one_ahead(
+    pool: ThreadPoolExecutor, make: Callable[[int], T], numbers: Iterable[int]
+) -> Iterator[T]:
+    """What is made of numbers, the next one of which is being made meanwhile."""
+    coming: Future[T] | None = None
+    for number in numbers:
+        ready, coming = coming, pool.submit(make, number)
+        if ready is not None:
+            yield ready.result()
+    if coming is not None:
+        yield coming.result()
