@@ -84,7 +84,7 @@ def stepped(work: str, batch: int, is_gpu: bool, limit: float) -> Done:
     text, fault = run(command, is_gpu, limit)
     if fault:
         return Done(fault)
-    figures = json.loads(text)
+    figures = json.loads(text)["figures"]
     first = figures["compile_s"] + figures["trace_s"]
     return Done(f"{figures['configs_per_s']:,.0f} after {first:.0f} s", [figures["fingerprint"]])
 

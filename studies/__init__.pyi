@@ -4,6 +4,7 @@ from .cache import cache_contents
 from .commission.run import run_commission
 from .commission.spec import load_measured
 from .config import configure, info
+from .documents import schema
 from .engine.batched import batched
 from .engine.dataset import load
 from .engine.design import load_design
@@ -22,7 +23,6 @@ from .laws.run import run_laws
 from .papers.run import run_paper
 from .screen.run import run_screen
 from .screen.shards import screen_of
-from .show.document import schema
 from .single.plant import controller_of, plant_of, write_system
 from .single.run import replay, simulate
 from .space.spec import load_sweep, parse_sweep

@@ -10,9 +10,9 @@ import os
 import re
 import stat
 from pathlib import Path
-from typing import NamedTuple
 
 from studies.errors import StudyError
+from studies.results.labelled import Labelled, told
 
 #: Names the folder instead of the user's cache folder; JAX's own name.
 VARIABLE = "JAX_COMPILATION_CACHE_DIR"
@@ -30,19 +30,22 @@ _OWN = re.compile(r"\.?(program|data|kernel|passport)-[0-9a-f]{64}(\.(\d+-)?[0-9
 _XLA = re.compile(r"\w+-[0-9a-f]{64}-(cache|atime)")
 
 
-class Kept(NamedTuple):
+class Kept(Labelled):
     """Files of one kind."""
 
-    kind: str  # a key of `KINDS`
-    files: int
-    bytes: int
+    kind: str = told("xla, program, data, kernel or passport")
+    files: int = told("how many")
+    bytes: int = told("how large together")
 
 
-class CacheContents(NamedTuple):
-    """What a folder of compiled programs holds, or what has been removed from it."""
+class CacheContents(Labelled, command="cache"):
+    """What `studies cache --json` prints: compiled programs that are kept, or with --clear have
+    been removed.
+    """
 
-    folder: str
-    kinds: tuple[Kept, ...]  # one for each of `KINDS`
+    folder: str = told("where they are")
+    is_cleared: bool = told("whether these files have been removed")
+    kinds: tuple[Kept, ...] = told("of each kind")
 
     @property
     def files(self) -> int:
@@ -117,7 +120,8 @@ def cache_contents(is_cleared: bool = False) -> CacheContents:
     except OSError as error:
         what = "cleared" if is_cleared else "read"
         raise StudyError(f"{folder}: cannot be {what} ({error.strerror or error})") from None
-    return CacheContents(str(folder), tuple(Kept(kind, *both) for kind, both in count.items()))
+    kinds = tuple(Kept(kind, *both) for kind, both in count.items())
+    return CacheContents(str(folder), is_cleared, kinds)
 
 
 def _count(folder: Path, count: dict[str, list[int]], is_cleared: bool) -> None:

@@ -134,30 +134,19 @@ def _fit(fitted: Any) -> Card:
 
 def _certificate(certificate: Any) -> Card:
     """Of `certify` and `spillover_design`."""
+    from studies.results.labelled import records
     from studies.spillover.plots import margins
-    from studies.spillover.proofs import proof_texts
-    from studies.spillover.report import damping_text, residual_text, spillover_text, verdict
+    from studies.spillover.report import residual_text, statements
 
-    texts = [text(certificate) for text in (damping_text, spillover_text, residual_text)]
-    proven = () if certificate.proofs is None else proof_texts(certificate.proofs)
-    lines = [verdict(certificate), *texts, *proven, *certificate.notes]
-    least = np.argsort(np.where(certificate.exists, certificate.margin, np.inf), axis=None)
-    rows = []
-    for k in least[: min(MOST, certificate.exists.sum())]:
-        at = np.unravel_index(k, certificate.exists.shape)
-        plant = certificate.plants[at]
-        rows.append(
-            [
-                plant.basis,
-                str(plant.mismatch),
-                str(plant.n_modes),
-                margin_text(certificate.margin[at], 3),
-                certificate.breaking[at] or "-",
-            ]
-        )
+    lines = [*statements(certificate), residual_text(certificate), *certificate.notes]
+    plants = sorted(records(certificate, certificate.ROWS), key=lambda x: x["gain_margin"])
+    names = "basis", "mismatch", "plant_modes", "gain_margin", "broken_by"
+    rows = [[str(plant[name]) or "-" for name in names] for plant in plants[:MOST]]
+    for row, plant in zip(rows, plants, strict=False):
+        row[3] = margin_text(plant["gain_margin"], 3)
     figure, ax = figures.one_panel(2.6)
     margins(certificate, ax)
-    heads = ["basis", "mismatch", "plant modes", "gain margin", "broken by"]
+    heads = [name.replace("_", " ") for name in names]
     return Card(certificate.study.title, [x for x in lines if x], heads, rows, figure=figure)
 
 

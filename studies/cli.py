@@ -20,7 +20,7 @@ from rich.table import Table
 from rich.text import Text
 from typer.exceptions import Abort, TyperException
 
-from studies import __version__
+from studies import __version__, documents
 from studies.atlas.commands import add_commands as add_atlas
 from studies.bench.commands import add_commands as add_bench
 from studies.cache import KINDS, VARIABLE, Kept, cache_contents, is_shared
@@ -31,9 +31,8 @@ from studies.export.commands import add_commands as add_export
 from studies.fitting.commands import add_commands as add_fit
 from studies.laws.commands import add_commands as add_laws
 from studies.papers.commands import add_commands as add_paper
+from studies.results.document import AsJson, print_document
 from studies.screen.commands import add_commands as add_screen
-from studies.show import document
-from studies.show.document import AsJson, print_document
 from studies.single.commands import add_commands as add_single
 from studies.spillover.commands import add_commands as add_spillover
 from studies.sweeps.commands import add_commands as add_sweeps
@@ -267,11 +266,12 @@ def info(as_json: AsJson = False) -> None:
     """Show versions, devices, precision, compilation cache, and what sweeps run with."""
     start(gpu=True)
     from studies.config import info as facts
+    from studies.config import settings
     from studies.engine.executor import executor_text
 
     found = {**facts(), "executor": executor_text()}
     if as_json:
-        print_document("info", found)
+        print_document(settings(found))
         return
     table = Table(show_header=False)
     for name, value in found.items():
@@ -287,8 +287,7 @@ def cache(
     """Show where compiled programs are kept, how many and how large; or remove them."""
     found = cache_contents(clear)
     if as_json:
-        kinds = [one._asdict() for one in found.kinds]
-        print_document("cache", {"folder": found.folder, "is_cleared": clear, "kinds": kinds})
+        print_document(found)
         return
     console.print(f"folder: {found.folder}", soft_wrap=True)
     table = Table("removed" if clear else "kept", "files", "size [MiB]")
@@ -310,9 +309,9 @@ def schema(
 ) -> None:
     """Print the JSON schema of what a command prints with --json, or writes as JSON."""
     if command:
-        print(json.dumps(document.schema(command), indent=1))
+        print(json.dumps(documents.schema(command), indent=1))
         return
-    for name in document.documented():
+    for name in documents.DOCUMENTS:
         console.print(name)
 
 

@@ -12,13 +12,14 @@ import platform
 import re
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from studies.cache import chosen_folder, exposure, is_usable
 from studies.errors import CacheWarning, StudyError, field_error, nearest
+from studies.results.labelled import Labelled, labels, told
 from studies.threads import SharedSetting
 
 PACKAGE = "flexlink-studies"
@@ -230,6 +231,25 @@ def info() -> dict[str, Any]:
         "cache": cache_folder() or "none",
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
     }
+
+
+class CurrentSettings(Labelled, command="info", version=2):
+    """What `studies info --json` prints: versions and settings."""
+
+    versions: dict[str, str] = told("of packages and Python, or not installed")
+    untested_versions: str = told("installed, but the tests have never run with them; or none")
+    processor: str = told("of this machine")
+    devices: str = told("of JAX")
+    precision: Literal["float64", "float32"] = told("of numbers")
+    cache: str = told("folder of compiled programs, none if they are not kept")
+    xla_flags: str = told("in XLA_FLAGS")
+    executor: str = told("what sweeps run with")
+
+
+def settings(facts: Mapping[str, Any]) -> CurrentSettings:
+    """The same from `info`, with the executor."""
+    others = {name: x for name, x in facts.items() if name in labels(CurrentSettings)}
+    return CurrentSettings({name: x for name, x in facts.items() if name not in others}, **others)
 
 
 def untested() -> str:

@@ -12,13 +12,14 @@ from contextlib import suppress
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from studies import sources
 from studies.cache import chosen_folder, is_usable
 from studies.errors import StudyError
 from studies.publish import replacing
 from studies.reading import read_json
+from studies.results.labelled import Labelled, document, told
 
 if TYPE_CHECKING:
     from studies.study.spec import Study
@@ -28,16 +29,16 @@ _DECISIVE = ("studies.engine", "studies.export", "studies.verify")
 _SAFE = re.compile(r"[^\w .,:;()@+/*-]")
 
 
-class Passport(NamedTuple):
+class Passport(Labelled):
     """What a verification found, when and where."""
 
-    title: str  # of the study, "" for the paper's machine alone
-    passed: int  # rows
-    rows: int  # that could be checked
-    failed: tuple[str, ...]  # their assumptions
-    date: str  # ISO 8601
-    version: str
-    processor: str
+    title: str = told("of the study")
+    passed: int = told("rows that passed")
+    rows: int = told("rows that could be checked")
+    failed: tuple[str, ...] = told("assumptions of the rows that failed")
+    date: str = told("ISO 8601")
+    version: str = told("of this package")
+    processor: str = told("on which it ran")
 
     @property
     def text(self) -> str:
@@ -61,7 +62,7 @@ def keep(study: Study, passport: Passport) -> None:
         return
     # a full disk must not turn a verification into a failure
     with suppress(StudyError), replacing(_file(study, folder)) as temporary:
-        content = passport._asdict()
+        content = document(passport)
         temporary.write_text(json.dumps(content | {"digest": _hash(content)}), encoding="utf-8")
 
 
@@ -73,15 +74,9 @@ def find(study: Study | None) -> Passport | None:
         data: dict[str, Any] = read_json(_file(study, chosen_folder()))
         if data.pop("digest") != _hash(data):
             return None
-        return Passport(
-            title=_plain(data["title"]),
-            passed=int(data["passed"]),
-            rows=int(data["rows"]),
-            failed=tuple(map(_plain, data["failed"])),
-            date=_plain(data["date"]),
-            version=_plain(data["version"]),
-            processor=_plain(data["processor"]),
-        )
+        words = {name: _plain(data[name]) for name in ("title", "date", "version", "processor")}
+        failed = tuple(map(_plain, data["failed"]))
+        return Passport(passed=int(data["passed"]), rows=int(data["rows"]), failed=failed, **words)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None  # not there, or damaged: not verified
 

@@ -22,6 +22,7 @@ import numpy as np
 from studies.errors import StudyError
 from studies.publish import check_target, replacing
 from studies.reading import open_hdf5
+from studies.results.labelled import Variable as Variable
 
 # What the words of flag_meanings may not contain.
 _NO_FLAG = re.compile(r"[^A-Za-z0-9_.+@-]+")
@@ -38,23 +39,6 @@ class LazyArray(NamedTuple):
     shape: tuple[int, ...]
     dtype: np.dtype
     read: Callable[[slice], np.ndarray]
-
-
-class Variable(NamedTuple):
-    """One labelled array.
-
-    data: numbers, booleans or text, one axis per name in dims; for writing, also `LazyArray`.
-    dims: name of each axis; a one-dimensional variable named like its axis is its coordinate.
-    units: SI symbol such as "m" or "Hz", "1" for none. Not "seconds": xarray turns that into dates.
-    long_name: what it is, in words.
-    flags: meaning of each number, for codes; flag_values and flag_meanings in the file, _ for " ".
-    """
-
-    data: Any
-    dims: tuple[str, ...]
-    units: str
-    long_name: str
-    flags: Mapping[int, str] | None = None
 
 
 def write_store(

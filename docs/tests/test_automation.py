@@ -13,7 +13,7 @@ import pytest
 import typer
 
 from studies.cli import app
-from studies.show.document import documented
+from studies.documents import DOCUMENTS
 from studies.space.spec import parse_sweep
 from studies.study.template import toml_text
 from tests import TOP
@@ -87,4 +87,4 @@ def test_calls_and_their_options_exist():
         known = {opt for parameter in commands[name].params for opt in parameter.opts}
         assert {word for word in words if word.startswith("--")} <= known, call
     told = {call.split()[0] for call in calls if "--json" in call}
-    assert told == set(documented()) - WRITERS - {"bench"}
+    assert told == set(DOCUMENTS) - WRITERS - {"bench"}

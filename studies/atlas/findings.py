@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from studies.atlas.platform import PlatformError, Responses, platform_error, responses
@@ -12,6 +10,8 @@ from studies.atlas.workspace import Map, PoseModes, map_workspace, natural_modes
 from studies.engine.batches import ProgressCallback
 from studies.engine.frame import frame_of
 from studies.engine.preflight import check_run
+from studies.results.labelled import Labelled, derived, labelled, told, unwritten
+from studies.study.labels import POSE_UNITS
 from studies.study.spec import Study
 
 #: The pose near the border is at least this far from a singularity [rad].
@@ -22,27 +22,47 @@ FREQUENCY = np.linspace(2.0, 600.0, 300)
 _ROUND = np.linspace(-3.0, 3.0, 13)
 
 
-class AtlasFindings(NamedTuple):
+class AtlasFindings(Labelled):
     """What the atlas found."""
 
-    study: Study
-    choices: Subsets  # of links, (settings, C, 8)
-    subsets: Subsets | None  # of modes, where they matter, (settings, 2^(3C))
-    platform: PlatformError
-    responses: Responses
-    map: Map
-    poses: np.ndarray  # the first of the path, and one near the border [m, m, rad], (2, 3)
-    modes: PoseModes  # at these poses
-    adc_step: np.ndarray  # of one ADC step, in the deflection of mode 1 [m], (3,)
+    study: Study = unwritten()
+    choices: Subsets = unwritten()  # of links, (settings, C, 8)
+    subsets: Subsets | None = unwritten()  # of modes, where they matter, (settings, 2^(3C))
+    platform: PlatformError = told("what is left of control")
+    responses: Responses = told("of the linearised loop")
+    map: Map = told("of the workspace")
+    # the first of the path, and one near the border, (2, 3)
+    poses: np.ndarray = labelled(
+        POSE_UNITS, "pose", "mode_pose", "pose_axis", file_name="pose_of_modes"
+    )
+    modes: PoseModes = unwritten()  # at these poses
+    adc_step: np.ndarray = unwritten()  # of one ADC step, in the deflection of mode 1 [m], (3,)
+
+    @derived("Hz", "at these poses", "mode_pose", "natural_mode")
+    def mode_frequency(self) -> np.ndarray:
+        return self.modes.frequency
+
+    @derived(
+        "m; m; rad; m ...",
+        "pose and modal coordinates, largest entry 1",
+        "mode_pose",
+        "coordinate",
+        "natural_mode",
+    )
+    def mode_shape(self) -> np.ndarray:
+        return self.modes.shape
 
     @property
     def links(self) -> Subsets:
         """Choices of links with all their modes, (settings, 8)."""
         return self.choices.whole_links()
 
-    @property
+    @derived(
+        "1",
+        "largest change that modes 2 and up make, share of the uncontrolled mean square",
+        "setting",
+    )
     def beyond_first(self) -> np.ndarray:
-        """What modes 2 and up change at most [1], (settings,)."""
         return beyond_first(self.choices, self.adc_step)
 
     def labels(self, subsets: Subsets) -> list[str]:

@@ -6,7 +6,7 @@ flexible machine's error is vibration error (the paper's figures 5, 6, 8, 10 sho
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,13 +18,15 @@ from jaxmodel.linear import resting
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, loop_matrices
-from studies.atlas.subsets import link_label, long_enough
+from studies.atlas.subsets import link_label, long_enough, setting_label
 from studies.engine.batches import run_batches
 from studies.engine.eigenvalues import eigenvalues
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
 from studies.engine.runs import resolved_study
+from studies.results.labelled import Labelled, derived, labelled, unwritten
 from studies.study.cases import signed_power
+from studies.study.labels import POSE_UNITS
 from studies.study.spec import Study
 from studies.study.window import residual_delay
 
@@ -47,16 +49,36 @@ SOURCES = (
 OUTPUTS = ("link 1 [m]", "link 2 [m]", "link 3 [m]", "x [m]", "y [m]", "phi [rad]")
 
 
-class PlatformError(NamedTuple):
+_SERIES = ("time", "pose_axis")
+
+
+class PlatformError(Labelled):
     """Leading axis: SETTINGS; second one of `vibration`: LINK_SETS."""
 
-    time: np.ndarray  # [s], (T,)
-    command_end: np.ndarray  # [s], (s,)
-    window: np.ndarray  # whether a sample is in the residual window, (s, T)
-    drive: np.ndarray  # error with rigid links [m, m, rad], (s, T, 3)
-    vibration: np.ndarray  # error beyond that [m, m, rad], (s, 4, T, 3)
-    pose: np.ndarray  # of the platform [m, m, rad], (s, 4, T, 3)
-    modal: np.ndarray  # modal coordinates of the plant [m], (s, 4, T, 3, R)
+    time: np.ndarray = labelled("s", "time", "time")
+    command_end: np.ndarray = labelled("s", "end of the shaped reference trajectory", "run")
+    window: np.ndarray = unwritten()  # whether a sample is in the residual window, (s, T)
+    drive: np.ndarray = labelled(
+        POSE_UNITS, "pose error with rigid links", "run", *_SERIES, file_name="drive_error"
+    )
+    vibration: np.ndarray = labelled(
+        POSE_UNITS,
+        "pose error beyond that of rigid links",
+        "run",
+        "run_links",
+        *_SERIES,
+        file_name="vibration_error",
+    )
+    pose: np.ndarray = unwritten()  # of the platform [m, m, rad], (s, 4, T, 3)
+    modal: np.ndarray = unwritten()  # modal coordinates of the plant [m], (s, 4, T, 3, R)
+
+    @derived("1", "move, shaper", "run")
+    def run(self) -> list[str]:
+        return [setting_label(s) for s in SETTINGS]
+
+    @derived("1", "controlled links", "run_links")
+    def run_links(self) -> list[str]:
+        return list(LINK_LABELS)
 
     def rms(self, error: np.ndarray) -> np.ndarray:
         """Root mean square of an error (s, ..., T, 3) over the window, (s, ..., 3)."""
@@ -124,12 +146,28 @@ def _with_links(case: Case, links: tuple[bool, ...]) -> Case:
     return case._replace(control=case.control._replace(link_mask=mask))
 
 
-class Responses(NamedTuple):
+#: Axes of responses.
+_RESPONSE = ("run_links", "response_frequency", "output", "source")
+
+
+class Responses(Labelled):
     """Linearised sampled loop: effects of forces held over a sample."""
 
-    frequency: np.ndarray  # [Hz], (F,)
-    value: np.ndarray  # complex, by LINK_SETS, OUTPUTS and SOURCES; NaN if unstable, (4, F, 6, 6)
-    radius: np.ndarray  # spectral radius of the sampled loop at the design's gains [1], (4,)
+    frequency: np.ndarray = labelled(
+        "Hz", "of the responses", "response_frequency", file_name="response_frequency"
+    )
+    # complex, by LINK_SETS, OUTPUTS and SOURCES; NaN if unstable, (4, F, 6, 6)
+    value: np.ndarray = unwritten()
+    # spectral radius of the sampled loop at the design's gains [1], (4,)
+    radius: np.ndarray = unwritten()
+
+    @derived("m/N and alike", "magnitude of the response of the sampled loop", *_RESPONSE)
+    def response_size(self) -> np.ndarray:
+        return np.abs(self.value)
+
+    @derived("rad", "its phase", *_RESPONSE)
+    def response_phase(self) -> np.ndarray:
+        return np.angle(self.value)
 
     @property
     def is_stable(self) -> np.ndarray:

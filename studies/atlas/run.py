@@ -17,8 +17,6 @@ from studies import config
 from studies.atlas.attribution import interaction, shapley
 from studies.atlas.figures import FIGURES, MODE_FIGURES, write_animation
 from studies.atlas.findings import AtlasFindings, adc_step, evaluate_atlas
-from studies.atlas.platform import LINK_LABELS
-from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.report import report
 from studies.atlas.subsets import (
     CHOICES,
@@ -34,17 +32,17 @@ from studies.atlas.subsets import (
     setting_label,
     subset_label,
 )
-from studies.atlas.workspace import PAIRS
-from studies.engine.columns import axis_variables
+from studies.engine.columns import axis_variables, named
 from studies.engine.folder import ATLASES, locked_folder, refuse_existing
 from studies.engine.progress import Phases
 from studies.engine.run_data import run_attributes
 from studies.errors import StudyError
 from studies.publish import REPORT, publish
+from studies.results.labelled import Variable, Variables, variables
 from studies.show.figures import draw
 from studies.show.sketch import sketch
 from studies.space.spec import SweepSpec
-from studies.store import Variable, axis_sizes, write_store
+from studies.store import axis_sizes, write_store
 from studies.study.spec import Study
 from studies.sweeps.run import run_sweep, sweep_phases
 from studies.threads import serial_blas
@@ -142,7 +140,7 @@ def _finish(
     phases.begin("draw")
     drawn = FIGURES if findings.subsets is None else FIGURES | MODE_FIGURES
     with publish(out, [f"{x}.{kind}" for x in MODE_FIGURES for kind in ("png", "pdf")]) as staging:
-        write_store(staging / DATA, variables(findings), run_attributes(study))
+        write_store(staging / DATA, atlas_variables(findings), run_attributes(study))
         draw(staging, {name: partial(plot, findings) for name, plot in drawn.items()}, has_pdf)
         draw(staging, {"machine": partial(sketch, study)})
         write_animation(findings, staging)
@@ -161,180 +159,59 @@ def sound_settings(subsets: Subsets) -> tuple[Subsets, list[str]]:
     return subsets.each(lambda values: values[is_sound])._replace(setting=kept), dropped
 
 
-def variables(findings: AtlasFindings) -> dict[str, Variable]:
+def atlas_variables(findings: AtlasFindings) -> dict[str, Variable]:
     """All variables of `atlas.h5`."""
-    found = {
-        **_choice_variables(findings),
-        **(_mode_variables(findings.subsets) if findings.subsets is not None else {}),
-        **_map_variables(findings),
-        **_run_variables(findings),
-    }
+    found, choices = Variables(), findings.choices
+    labels = [setting_label(s) for s in choices.setting]
+    found.put("setting", labels, "1", "move, shaper", "setting")
+    text = "how many modes of each controlled link are controlled, from the first on"
+    found.put("first_modes", np.arange(1, choices.modes + 1), "1", text, "first_modes")
+    found.put("links", [link_label(k) for k in CHOICES], "1", "controlled", "links")
+    found.put("target", list(TARGETS), "1", "whose residual", "target")
+    chosen = choices.each(lambda values: values[:, :, CHOICES])
+    found |= _residual_variables(chosen, ("setting", "first_modes", "links"), "")
+    _put_game(found, choices.whole_links(), "setting", "links", "link", "")
+    if findings.subsets is not None:
+        _put_modes(found, findings.subsets)
+    found |= variables(findings)
     return found | axis_variables(findings.study, axis_sizes(found))
 
 
-def _names(values: list[str], axis: str, text: str) -> Variable:
-    return Variable(np.array(values), (axis,), "1", text)
-
-
-def _choice_variables(findings: AtlasFindings) -> dict[str, Variable]:
-    """Of the choices of links, and the game whose players are whole links."""
-    choices = findings.choices
-    axes = ("setting", "first_modes", "links")
-    return {
-        "setting": _names([setting_label(s) for s in choices.setting], "setting", "move, shaper"),
-        "first_modes": Variable(
-            np.arange(1, choices.modes + 1),
-            ("first_modes",),
-            "1",
-            "how many modes of each controlled link are controlled, from the first on",
-        ),
-        "links": _names([link_label(k) for k in CHOICES], "links", "controlled"),
-        "target": _names(list(TARGETS), "target", "whose residual"),
-        "beyond_first": Variable(
-            findings.beyond_first,
-            ("setting",),
-            "1",
-            "largest change that modes 2 and up make, share of the uncontrolled mean square",
-        ),
-        **_residual_variables(choices.each(lambda values: values[:, :, CHOICES]), axes, ""),
-        **_game_variables(choices.whole_links(), "setting", "links", "link", ""),
-    }
-
-
-def _mode_variables(subsets: Subsets) -> dict[str, Variable]:
-    """Of all subsets of modes, and the game whose players are modes."""
+def _put_modes(found: Variables, subsets: Subsets) -> None:
+    """All subsets of modes, and the game whose players are modes."""
     order, axes = in_order(3 * subsets.modes), ("mode_setting", "mode_subset")
     labels = [setting_label(s) for s in subsets.setting]
+    found.put("mode_setting", labels, "1", "move, shaper", "mode_setting")
     names = [subset_label(k, subsets.modes) for k in order]
-    return {
-        "mode_setting": _names(labels, "mode_setting", "move, shaper"),
-        "mode_subset": _names(names, "mode_subset", "controlled, link.mode"),
-        "player": _names(player_labels(subsets.modes), "player", "link.mode"),
-        **_residual_variables(subsets.each(lambda values: values[:, order]), axes, "mode_"),
-        **_game_variables(subsets, *axes, "player", "mode_"),
-    }
+    found.put("mode_subset", names, "1", "controlled, link.mode", "mode_subset")
+    found.put("player", player_labels(subsets.modes), "1", "link.mode", "player")
+    found |= _residual_variables(subsets.each(lambda values: values[:, order]), axes, "mode_")
+    _put_game(found, subsets, *axes, "player", "mode_")
 
 
 def _residual_variables(
     subsets: Subsets, axes: tuple[str, ...], prefix: str
 ) -> dict[str, Variable]:
     """Residuals by the axes of `subsets`; prefix: of the names."""
-    per_link = (*axes, "link")
     parts = {
-        "residual_rms": Variable(
-            subsets.station, (*per_link, "station"), "m", "rms chord deflection in the window"
-        ),
-        "pose_error_rms": Variable(
-            subsets.pose, (*axes, "pose_axis"), "m; m; rad", "rms error in the window"
-        ),
-        "spectral_peak": Variable(
-            subsets.peak,
-            (*per_link, "controlled_mode"),
-            "m2/Hz",
-            "largest spectral density near each mode of the controller",
-        ),
-        "settling_time": Variable(
-            subsets.settling, per_link, "s", "after the reference trajectory"
-        ),
-        "peak_voltage": Variable(subsets.voltage, per_link, "V", "peak actuator voltage"),
+        "residual_rms": subsets.station,
+        "pose_error_rms": subsets.pose,
+        "settling_time": subsets.settling,
+        "peak_voltage": subsets.voltage,
     }
-    return {prefix + name: variable for name, variable in parts.items()}
+    found = {prefix + name: named(name, data, *axes) for name, data in parts.items()}
+    dims, text = (*axes, "link", "controlled_mode"), "largest spectral density near each mode"
+    return found | {f"{prefix}spectral_peak": Variable(subsets.peak, dims, "m2/Hz", text)}
 
 
-def _game_variables(
-    subsets: Subsets, setting: str, subset: str, player: str, prefix: str
-) -> dict[str, Variable]:
+def _put_game(
+    found: Variables, subsets: Subsets, setting: str, subset: str, player: str, prefix: str
+) -> None:
     """What subsets remove, and how players share in it; axes: their names."""
-    game = subsets.removed()
+    game, axes = subsets.removed(), (setting, "target")
     order = in_order(int(np.log2(game.shape[-1])))
-    parts = {
-        "removed": Variable(
-            game[..., order],
-            (setting, "target", subset),
-            "1",
-            "share of the uncontrolled mean square that control takes away",
-        ),
-        "shapley_share": Variable(
-            shapley(game), (setting, "target", player), "1", "Shapley share of it"
-        ),
-        "interaction": Variable(
-            interaction(game),
-            (setting, "target", player, f"other_{player}"),
-            "1",
-            "Shapley interaction index of pairs",
-        ),
-    }
-    return {prefix + name: variable for name, variable in parts.items()}
-
-
-def _map_variables(findings: AtlasFindings) -> dict[str, Variable]:
-    chart = findings.map
-    grid = ("map_phi", "map_y", "map_x")
-    pairs = [f"{i + 1}-{k + 1}" for i, k in PAIRS]
-    return {
-        "map_x": Variable(chart.x, ("map_x",), "m", "platform x"),
-        "map_y": Variable(chart.y, ("map_y",), "m", "platform y"),
-        "map_phi": Variable(chart.phi, ("map_phi",), "rad", "platform turn"),
-        "lift": Variable(
-            chart.lift, (*grid, "link"), "1", "sines of the link angles, above 1 out of reach"
-        ),
-        "map_status": Variable(chart.status, grid, "1", "pose", status.REASONS),
-        "gamma": Variable(chart.gamma, (*grid, "link"), "rad", "link angles"),
-        "natural_frequency": Variable(
-            chart.frequency, (*grid, "natural_mode"), "Hz", "of the machine on its drive"
-        ),
-        "bending_frequency": Variable(
-            chart.bending, (*grid, "bending_mode"), "Hz", "the first three bending modes"
-        ),
-        "strain_share": Variable(
-            chart.share, (*grid, "bending_mode", "part"), "1", "strain energy in links and drive"
-        ),
-        "pair": _names(pairs, "pair", "two links"),
-        "inertial_coupling": Variable(
-            chart.coupling, (*grid, "pair"), "1", "of the links' first modes, pose condensed out"
-        ),
-        "pose_of_modes": Variable(findings.poses, ("mode_pose", "pose_axis"), "m; m; rad", "pose"),
-        "mode_frequency": Variable(
-            findings.modes.frequency, ("mode_pose", "natural_mode"), "Hz", "at these poses"
-        ),
-        "mode_shape": Variable(
-            findings.modes.shape,
-            ("mode_pose", "coordinate", "natural_mode"),
-            "m; m; rad; m ...",
-            "pose and modal coordinates, largest entry 1",
-        ),
-    }
-
-
-def _run_variables(findings: AtlasFindings) -> dict[str, Variable]:
-    runs, answers = findings.platform, findings.responses
-    series = ("run", "run_links", "time", "pose_axis")
-    return {
-        "run": _names([setting_label(s) for s in RUNS], "run", "move, shaper"),
-        "run_links": _names(list(LINK_LABELS), "run_links", "controlled links"),
-        "time": Variable(runs.time, ("time",), "s", "time"),
-        "command_end": Variable(
-            runs.command_end, ("run",), "s", "end of the shaped reference trajectory"
-        ),
-        "drive_error": Variable(
-            runs.drive, ("run", "time", "pose_axis"), "m; m; rad", "pose error with rigid links"
-        ),
-        "vibration_error": Variable(
-            runs.vibration, series, "m; m; rad", "pose error beyond that of rigid links"
-        ),
-        "response_frequency": Variable(
-            answers.frequency, ("response_frequency",), "Hz", "of the responses"
-        ),
-        "response_size": Variable(
-            np.abs(answers.value),
-            ("run_links", "response_frequency", "output", "source"),
-            "m/N and alike",
-            "magnitude of the response of the sampled loop",
-        ),
-        "response_phase": Variable(
-            np.angle(answers.value),
-            ("run_links", "response_frequency", "output", "source"),
-            "rad",
-            "its phase",
-        ),
-    }
+    text = "share of the uncontrolled mean square that control takes away"
+    found.put(f"{prefix}removed", game[..., order], "1", text, *axes, subset)
+    found.put(f"{prefix}shapley_share", shapley(game), "1", "Shapley share of it", *axes, player)
+    text, pairs = "Shapley interaction index of pairs", (player, f"other_{player}")
+    found.put(f"{prefix}interaction", interaction(game), "1", text, *axes, *pairs)

@@ -21,6 +21,7 @@ from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from studies.engine.preflight import check_pose, check_run
 from studies.engine.programs import kept_jit
+from studies.results.labelled import Labelled, derived, labelled
 from studies.study.geometry import machine_geometry
 from studies.study.spec import Study
 
@@ -46,19 +47,40 @@ class PoseModes(NamedTuple):
     coupling: np.ndarray  # of the links' first modes, by PAIRS [1], (..., 3)
 
 
-class Map(NamedTuple):
+_GRID = ("map_phi", "map_y", "map_x")
+_OF_LINKS = (*_GRID, "link")
+_BENDING = (*_GRID, "bending_mode")
+
+
+class Map(Labelled):
     """Axes: phi, y, x; NaN where a pose is infeasible, except in `lift`."""
 
-    x: np.ndarray  # [m], (n,)
-    y: np.ndarray  # [m], (n,)
-    phi: np.ndarray  # [rad], (p,)
-    status: np.ndarray  # code of the pose, (p, n, n)
-    lift: np.ndarray  # sines of the link angles, above 1 out of reach [1], (p, n, n, 3)
-    gamma: np.ndarray  # link angles [rad], (p, n, n, 3)
-    frequency: np.ndarray  # all natural frequencies [Hz], (p, n, n, m)
-    bending: np.ndarray  # the three dominated by the links' first bending [Hz], (p, n, n, 3)
-    share: np.ndarray  # their strain energy in links 1, 2, 3 and drive [1], (p, n, n, 3, 4)
-    coupling: np.ndarray  # of the links' first modes, by PAIRS [1], (p, n, n, 3)
+    x: np.ndarray = labelled("m", "platform x", "map_x", file_name="map_x")
+    y: np.ndarray = labelled("m", "platform y", "map_y", file_name="map_y")
+    phi: np.ndarray = labelled("rad", "platform turn", "map_phi", file_name="map_phi")
+    status: np.ndarray = labelled("1", "pose", *_GRID, file_name="map_status", flags=status.REASONS)
+    lift: np.ndarray = labelled("1", "sines of the link angles, above 1 out of reach", *_OF_LINKS)
+    gamma: np.ndarray = labelled("rad", "link angles", *_OF_LINKS)
+    frequency: np.ndarray = labelled(
+        "Hz", "of the machine on its drive", *_GRID, "natural_mode", file_name="natural_frequency"
+    )
+    bending: np.ndarray = labelled(
+        "Hz", "the first three bending modes", *_BENDING, file_name="bending_frequency"
+    )
+    share: np.ndarray = labelled(
+        "1", "strain energy in links and drive", *_BENDING, "part", file_name="strain_share"
+    )
+    coupling: np.ndarray = labelled(
+        "1",
+        "of the links' first modes, pose condensed out",
+        *_GRID,
+        "pair",
+        file_name="inertial_coupling",
+    )
+
+    @derived("1", "two links", "pair")
+    def pair(self) -> list[str]:
+        return [f"{i + 1}-{k + 1}" for i, k in PAIRS]
 
     @property
     def margin(self) -> np.ndarray:

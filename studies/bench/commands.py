@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any
 
 import typer
@@ -10,7 +11,7 @@ from rich.table import Table
 
 from studies.config import start
 from studies.errors import StudyError
-from studies.show.document import AsJson, print_document
+from studies.results.document import AsJson, print_document
 
 
 def add_commands(app: typer.Typer, console: Console) -> None:
@@ -39,23 +40,20 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         start(precision, gpu=True)
         from studies.bench.run import run_bench
 
-        figures = run_bench(what, work, executor, batch, cases)
+        found = run_bench(what, work, executor, batch, cases)
         if as_json:
-            print_document("bench", {"peers": figures} if isinstance(figures, list) else figures)
-        elif isinstance(figures, list):
-            console.print(_peers(figures))
+            print_document(found)
+        elif found.peers:
+            console.print(_peers(found.peers))
         else:
-            console.print(_figures(figures))
+            console.print(_figures(found.figures or {}))
 
 
-def _peers(rows: list[dict[str, Any]]) -> Table:
+def _peers(rows: Iterable[Any]) -> Table:
     table = Table("W0 with", "configurations/s", "error [share of the largest rms]", "times slower")
     for row in rows:
         table.add_row(
-            row["peer"],
-            f"{row['configs_per_s']:.3g}",
-            f"{row['error']:.1e}",
-            f"{row['times_slower']:.3g}",
+            row.peer, f"{row.configs_per_s:.3g}", f"{row.error:.1e}", f"{row.times_slower:.3g}"
         )
     return table
 

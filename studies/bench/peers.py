@@ -35,6 +35,7 @@ from studies.engine.executor import Executor
 from studies.engine.plan import Layout
 from studies.kernels.llvm import is_available
 from studies.reference import lagrangian as reference
+from studies.results.labelled import Labelled, labelled, told
 from studies.study.cases import as_arrays
 from studies.study.spec import paper_study
 
@@ -67,13 +68,13 @@ class Work(NamedTuple):
         return as_arrays(jax.tree.unflatten(jax.tree.structure(self.cases), [x[:n] for x in wide]))
 
 
-class PeerRow(NamedTuple):
+class PeerRow(Labelled):
     """Measurements of a peer."""
 
-    peer: str
-    configs_per_s: float
-    error: float  # largest error of a residual rms, as a share of the largest residual rms
-    times_slower: float  # than the fastest peer
+    peer: str = told("solver")
+    configs_per_s: float = labelled("1/s", "configurations")
+    error: float = labelled("1", "largest one of a residual rms, over the largest residual rms")
+    times_slower: float = labelled("1", "than the fastest peer")
 
 
 class Peer(NamedTuple):
@@ -135,7 +136,7 @@ def bench_peers(
         )
     rows.sort(key=lambda row: -row.configs_per_s)
     best = rows[0].configs_per_s
-    return [row._replace(times_slower=best / row.configs_per_s) for row in rows]
+    return [row.replace(times_slower=best / row.configs_per_s) for row in rows]
 
 
 def speed_ratio(

@@ -7,13 +7,21 @@ from typing import Any
 from rich.console import Console
 
 from studies.bench.gradients import bench_gradients
-from studies.bench.peers import bench_peers
+from studies.bench.peers import PeerRow, bench_peers
 from studies.bench.works import bench_runs, bench_sweep
 from studies.errors import StudyError, field_error
 from studies.kernels.cpu import full_effort
+from studies.results.labelled import Labelled, told
 
 #: Cases of the work `sweep`.
 SWEEP_CASES = 100_000
+
+
+class Benchmark(Labelled, command="bench", version=2):
+    """What `studies bench --json` prints: speed and memory on this machine."""
+
+    figures: dict[str, Any] | None = told("by name, with its unit; null for peers", default=None)
+    peers: tuple[PeerRow, ...] = told("W0 with each solver; of `studies bench peers`", default=())
 
 
 def run_bench(
@@ -23,7 +31,7 @@ def run_bench(
     batch: int = 0,
     cases: int = 0,
     console: Console | None = None,
-) -> dict[str, Any] | list[dict[str, Any]]:
+) -> Benchmark:
     """Measure speed and memory on this machine.
 
     Args:
@@ -35,7 +43,7 @@ def run_bench(
         console: where progress goes; default: standard error.
 
     Returns:
-        figures by name; for peers, one row each.
+        figures by name, or peers.
 
     Raises:
         StudyError: an unknown option, or one that has no effect.
@@ -45,13 +53,13 @@ def run_bench(
     _check(what, work, executor, batch, cases)
     console = console or Console(stderr=True, highlight=False, markup=False)
     if work == "sweep":
-        return bench_sweep(cases or SWEEP_CASES, console)
+        return Benchmark(bench_sweep(cases or SWEEP_CASES, console))
     with full_effort():
         if what == "peers":
-            return [row._asdict() for row in bench_peers(console.print)]
+            return Benchmark(peers=tuple(bench_peers(console.print)))
         if work == "grad":
-            return bench_gradients(executor, batch)
-        return bench_runs(work or "W1", executor, batch)
+            return Benchmark(bench_gradients(executor, batch))
+        return Benchmark(bench_runs(work or "W1", executor, batch))
 
 
 def _check(what: str, work: str, executor: str, batch: int, cases: int) -> None:

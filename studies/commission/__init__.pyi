@@ -1,4 +1,5 @@
-from .run import Commissioned, run_commission
+from .findings import CommissionFindings
+from .run import run_commission
 from .spec import MeasuredSpec, load_measured
 
-__all__ = ["Commissioned", "MeasuredSpec", "load_measured", "run_commission"]
+__all__ = ["CommissionFindings", "MeasuredSpec", "load_measured", "run_commission"]

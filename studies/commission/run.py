@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
 
 from studies import config
+from studies.commission.findings import CommissionFindings
 from studies.commission.machines import margins_on
-from studies.commission.report import CommissionFindings, document, report, summary
+from studies.commission.report import report
 from studies.commission.spec import MeasuredSpec
 from studies.commission.stages import (
     STAGES,
@@ -39,26 +39,12 @@ from studies.engine.folder import (
 )
 from studies.errors import StudyError
 from studies.export.firmware.build import check_tools
-from studies.publish import REPORT, announce, publish, replacing, shown
+from studies.publish import REPORT, announce, publish, replacing
+from studies.results.document import json_text
 
 DOCUMENT, MARGINS = "commission.json", "margins.npy"
 #: Modules that determine the numbers, with everything they import.
 DECISIVE = ("studies.commission.stages", "studies.commission.machines")
-
-
-class Commissioned(NamedTuple):
-    """A commissioning as far as it went."""
-
-    out: Path
-    outcome: CommissionFindings
-
-    @property
-    def is_good(self) -> bool:
-        """Whether there is firmware that can be used."""
-        return not self.outcome.refusals
-
-    def _repr_html_(self) -> str:
-        return shown(self)
 
 
 def run_commission(
@@ -66,7 +52,7 @@ def run_commission(
     out: str | Path,
     is_resumed: bool = False,
     console: Console | None = None,
-) -> Commissioned:
+) -> CommissionFindings:
     """Lead from measurements to verified firmware, or refuse and say what is missing.
 
     Args:
@@ -89,17 +75,17 @@ def run_commission(
         keep_request(out / COMMISSIONINGS.mark, request, checked)
         outcome = _outcome(measured, out, console)
         with publish(out) as staging:
-            (staging / DOCUMENT).write_text(document(measured, outcome), encoding="utf-8")
+            (staging / DOCUMENT).write_text(json_text(outcome), encoding="utf-8")
             (staging / REPORT).write_text(report(measured, outcome), encoding="utf-8")
-    for line in summary(outcome):
+    for line in outcome.summary:
         console.print(line, soft_wrap=True)
     announce(console, out / REPORT)
-    return Commissioned(out, outcome)
+    return outcome
 
 
 def _outcome(measured: MeasuredSpec, out: Path, console: Console) -> CommissionFindings:
     """All stages, up to the first one whose answer does not support the next."""
-    outcome = CommissionFindings(out)
+    outcome = CommissionFindings(out, measured.study.title)
     for stage in STAGES:
         fault = _run(stage, measured, out, console)
         outcome = _judged(outcome, stage, fault, measured, console)
@@ -130,9 +116,9 @@ def _judged(
     outcome: CommissionFindings, stage: Stage, fault: str, measured: MeasuredSpec, console: Console
 ) -> CommissionFindings:
     """The outcome with a stage's answer, and with what speaks against going on."""
-    outcome = outcome._replace(done=stage.name)
+    outcome = outcome.replace(last_stage=stage.name)
     if fault:
-        return outcome._replace(refusals=(f"{stage.name}: {fault}",))
+        return outcome.replace(refusals=(f"{stage.name}: {fault}",))
     return _JUDGES[stage.name](outcome, measured.commission.gain_margin, console)
 
 
@@ -141,7 +127,7 @@ def _judge_fit(outcome: CommissionFindings, wanted: float, console: Console) -> 
     fit = fit_document(outcome.out)
     is_ground = fit["is_explained"] and fit["is_converged"]
     texts = () if is_ground else tuple(str(text) for text in fit["messages"][:3])
-    return outcome._replace(fit=fit, refusals=texts)
+    return outcome.replace(fit=fit, refusals=texts)
 
 
 def _judge_tuned(
@@ -152,13 +138,13 @@ def _judge_tuned(
     tuned = tuned_design(outcome.out).study
     is_fast = has_fast_motion(outcome.out, tuned)
     price = price_text(outcome.out, tuned)
-    outcome = outcome._replace(tuned=tuned, is_fast=is_fast, margins=margins, price=price)
+    outcome = outcome.replace(tuned=tuned, is_fast=is_fast, margins=margins, price=price)
     low = int(np.sum(margins < wanted))
     text = (
         f"on {low} of {len(margins)} machines that the data leave possible the gain margin "
         f"is below {wanted:g}, down to {margins.min():.3g}"
     )
-    return outcome._replace(refusals=(text,) if low else ())
+    return outcome.replace(refusals=(text,) if low else ())
 
 
 def _judge_certificate(
@@ -167,14 +153,14 @@ def _judge_certificate(
     certificate = certificate_document(outcome.out)
     text = f"certificate {certificate['verdict']}"
     refusals = () if certificate["is_passed"] else (text,)
-    return outcome._replace(certificate=certificate, refusals=refusals)
+    return outcome.replace(certificate=certificate, refusals=refusals)
 
 
 def _judge_firmware(
     outcome: CommissionFindings, wanted: float, console: Console
 ) -> CommissionFindings:
     text = "the exported code does not behave as the controller that was designed"
-    return outcome._replace(refusals=() if is_verified(outcome.out) else (text,))
+    return outcome.replace(refusals=() if is_verified(outcome.out) else (text,))
 
 
 #: By name of the stage: its answer, of the outcome so far and the least gain margin.

@@ -83,7 +83,7 @@ def _lowered(study: Study, possible: Possible, measured: MeasuredSpec) -> Study:
     """The study with gains so low that later stages find their margins, where any gains do."""
     certificate = certify(study, certified_margin(measured), (study.link.basis,))
     share = min(
-        np.nanmin(certificate.margin) / certificate.required,
+        certificate.smallest_margin / certificate.required_margin,
         margins_on(possible, study).min() / measured.commission.gain_margin,
     )
     if not 0 < share < 1:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +23,7 @@ from studies.engine.host_loop import SampledLoop, name_motion
 from studies.engine.nearest import Loops, nearest_unstable
 from studies.engine.programs import kept_jit
 from studies.errors import StudyError, field_error, nearest
+from studies.results.breaking import BreakingChange, ChangedNumber
 from studies.threads import serial_blas
 
 #: One unit of each kind of change: how far it may well be off on a machine as built, in the units
@@ -53,55 +53,8 @@ UNITS = MachineChange(
 MOST = 3.0
 #: Largest share of the platform's mass that is taken off [1].
 LIGHTER = 0.5
-#: Parts named in words: those that make up this share of the squared distance, at most so many.
-NAMED, LONGEST = 0.9, 5
 #: Smaller parts are not counted [tolerances].
 SMALL = 0.1
-
-
-class ChangedNumber(NamedTuple):
-    """One number of a changed machine."""
-
-    name: str  # such as "patch 2 of link 1"
-    text: str  # with its change, such as "patch 2 of link 1 1.8 mm towards C"
-    size: float  # of its change [tolerances]
-
-
-class BreakingChange(NamedTuple):
-    """The nearest machine with which a design's controller is unstable."""
-
-    distance: float  # Euclidean [tolerances]; 0: unstable as it is, inf: none was found
-    change: MachineChange  # NumPy arrays
-    parts: tuple[ChangedNumber, ...]  # by size, largest first
-    breaking: str  # what goes unstable, see `name_motion`; "" if none was found
-    tolerances: MachineChange  # one unit of each kind of change
-
-    @property
-    def text(self) -> str:
-        """In a sentence."""
-        if self.distance == 0:
-            return f"no change breaks it: it is unstable as it is, by {self.breaking}"
-        if not np.isfinite(self.distance):
-            return "no change within its limits that breaks it was found"
-        share = np.cumsum([part.size**2 for part in self.parts]) / self.distance**2
-        count = min(int(np.searchsorted(share, NAMED)) + 1, LONGEST, len(self.parts))
-        more = len(self.parts) - count
-        others = f" and {more} smaller change{'s' * (more > 1)}" if more else ""
-        listed = ", ".join(part.text for part in self.parts[:count])
-        return (
-            f"the smallest change that breaks it, {self.distance:.3g} tolerances: {listed}"
-            f"{others}; unstable is then {self.breaking}"
-        )
-
-    def record(self) -> dict[str, Any]:
-        """For a JSON document."""
-        return {
-            "distance": self.distance,
-            "text": self.text,
-            "unstable": self.breaking,
-            "changes": [part._asdict() for part in self.parts],
-            "tolerances": self.tolerances._asdict(),
-        }
 
 
 def parse_tolerances(texts: Iterable[str]) -> MachineChange:
@@ -153,7 +106,7 @@ def smallest_change(
     unit, lower, upper = (
         np.asarray(ravel_pytree(x)[0]) for x in _limits(structure, case, tolerances)
     )
-    found = []
+    found, units = [], tolerances._asdict()
     with serial_blas():
         for _, law in linear_parts(design.controller):
             law = law._replace(feedback=law.feedback.without_rivals())
@@ -164,14 +117,14 @@ def smallest_change(
     distance, x, one = min(found, key=lambda entry: entry[0])
     if x is None:
         zero = one.unpack(np.zeros_like(unit))
-        return BreakingChange(distance, zero, parts=(), breaking="", tolerances=tolerances)
+        return BreakingChange(distance, zero, parts=(), breaking="", tolerances=units)
     change = one.unpack(unit * x)
     return BreakingChange(
         distance=distance,
         change=change,
         parts=_parts(change, one.unpack(x)),
         breaking=one.breaking(x),
-        tolerances=tolerances,
+        tolerances=units,
     )
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from jaxmodel.loop_figures import HIGHEST, MARGIN_MODES, MARGINS, MOST_DELAY
 from jaxmodel.metrics import METRICS
 from jaxmodel.prepare import SPECTRUM_SPAN
+from studies.results.labelled import Variable, Variables
 from studies.space.table import CaseTable, as_numbers
-from studies.store import Variable
-from studies.study.labels import DISTANCE_TEXT, STATION_TEXT, STATUS_LABEL
+from studies.study.labels import DISTANCE_TEXT, POSE_UNITS, STATION_TEXT, STATUS_LABEL
 from studies.study.paths import field_unit, parse_entry
 from studies.study.spec import Study
 
@@ -127,13 +127,11 @@ def mask_unused(data: np.ndarray, axis: int, count: np.ndarray) -> None:
 
 def case_variables(table: CaseTable) -> dict[str, Variable]:
     """What distinguishes the cases: number, id, seed, repeat and every column."""
-    axis = ("case",)
-    variables = {
-        "case": Variable(np.arange(len(table)), axis, "1", "number of the case"),
-        "case_id": Variable(table.case_id.astype(str), axis, "1", "hash of the case's parameters"),
-        "seed": Variable(table.seed, axis, "1", "seed of noise and ripple"),
-        "repeat": Variable(table.repeat, axis, "1", "number of the repeat"),
-    }
+    found = Variables()
+    found.put("case", np.arange(len(table)), "1", "number of the case", "case")
+    found.put("case_id", table.case_id.astype(str), "1", "hash of the case's parameters", "case")
+    found.put("seed", table.seed, "1", "seed of noise and ripple", "case")
+    found.put("repeat", table.repeat, "1", "number of the repeat", "case")
     for name, column in table.columns.items():
         array = as_numbers(column, table.study.n_links)
         entry = parse_entry(name)
@@ -141,8 +139,8 @@ def case_variables(table: CaseTable) -> dict[str, Variable]:
         dims = _LIST_AXES.get(field, ())[-(array.ndim - 1) :] if array.ndim > 1 else ()
         if len(dims) != array.ndim - 1:
             dims = tuple(f"{name}_{k}" for k in range(1, array.ndim))
-        variables[name] = Variable(array, (*axis, *dims), field_unit(field), name)
-    return variables
+        found.put(name, array, field_unit(field), name, "case", *dims)
+    return found
 
 
 def axis_variables(
@@ -155,29 +153,54 @@ def axis_variables(
         sizes: length of each axis of the file.
         swept: fields that differ between its cases.
     """
-    axes = {"link": Variable(np.arange(1, study.n_links + 1), ("link",), "1", "link number")}
+    axes = Variables()
+    axes.put("link", np.arange(1, study.n_links + 1), "1", "link number", "link")
     if "pose_axis" in sizes:
-        axes["pose_axis"] = Variable(POSE[: study.n_pose], ("pose_axis",), "1", "pose component")
+        axes.put("pose_axis", POSE[: study.n_pose], "1", "pose component", "pose_axis")
     if "station" in sizes and "metrics.stations" not in swept:
-        stations = np.array(study.metrics.stations)
-        axes["station"] = Variable(stations, ("station",), "1", STATION_TEXT)
+        axes.put("station", np.array(study.metrics.stations), "1", STATION_TEXT, "station")
     if "spectrum_point" in sizes:
         ratio = np.linspace(1 - SPECTRUM_SPAN, 1 + SPECTRUM_SPAN, sizes["spectrum_point"])
-        axes["spectrum_point"] = Variable(
-            ratio, ("spectrum_point",), "1", "frequency over the modal frequency"
+        axes.put(
+            "spectrum_point", ratio, "1", "frequency over the modal frequency", "spectrum_point"
         )
     return axes
 
 
+#: Trajectories of a run: axes, unit and text.
+RECORD: dict[str, tuple[Any, ...]] = {
+    "time": (("time",), "s", "time"),
+    "pose": (("time", "pose_axis"), POSE_UNITS, "platform pose (x, y, phi)"),
+    "pose_error": (("time", "pose_axis"), POSE_UNITS, "pose minus shaped reference"),
+    "slider": (("time", "slider_axis"), "m", "actuated coordinate rho"),
+    "modal_coordinate": (("time", "link", "mode"), "m", "modal coordinates q of the plant"),
+    "controlled_coordinate": (
+        ("time", "link", "controlled_mode"),
+        "m",
+        "controller's modes seen by an ideal modal filter",
+    ),
+    "chord_deflection": (("time", "link"), "m", "mid-span relative to the chord B-C"),
+    "chord_deflection_stations": (
+        ("time", "link", "station"),
+        "m",
+        "deflection relative to the chord B-C at the stations",
+    ),
+    "sensor_voltage": (("time", "link", "patch"), "V", "raw sensor voltage"),
+    "actuator_voltage": (("time", "link", "patch"), "V", "actuator voltage"),
+    "slider_force": (("time", "slider_axis"), "N", "motor force"),
+}
+
+
 def label_of(name: str) -> tuple[Any, ...]:
-    """Axes after `case`, unit, long name and any flags of what a chunk holds."""
-    if name in PER_CASE or name in SCREENED:
-        return (PER_CASE | SCREENED)[name]
+    """Axes, unit, long name and any flags of a number or trajectory of a run."""
+    own = PER_CASE | SCREENED | RECORD
+    if name in own:
+        return own[name]
     metric = METRICS[name]
     return metric.dims, metric.unit, metric.text
 
 
-def labelled(name: str, data: Any) -> Variable:
-    """What a chunk holds, with its axes and labels."""
+def named(name: str, data: Any, *axes: str) -> Variable:
+    """A number or trajectory of runs, with its labels; axes: of the runs, before its own."""
     dims, *label = label_of(name)
-    return Variable(data, ("case", *dims), *label)
+    return Variable(data, (*axes, *dims), *label)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -15,6 +15,7 @@ from studies.engine.preflight import check_pose
 from studies.engine.programs import kept_jit
 from studies.engine.simplifications import warn_of_patches, warn_of_sizes
 from studies.publish import shown
+from studies.results.labelled import Labelled, derived, labelled, told, unwritten
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study, parse_study
 
@@ -24,18 +25,20 @@ EQUAL = 1e-6
 RIGID = 1e-6
 
 
-class ModeKind(NamedTuple):
-    """What holds most of a mode's energy."""
+class NaturalMode(Labelled):
+    """A natural mode, and what holds most of its energy."""
 
-    kind: str  # "link", "stretch": links lengthen, "drive", or "rigid": nothing holds it
-    share: float = np.nan  # of the potential energy [1]
-    links: tuple[int, ...] = ()  # which take part, from 1
-    order: int | None = None  # of the links' mode, from 1
-    platform: str | None = None  # what it does on its drive: "translates" or "turns"
+    mode: int = told("from 1")
+    frequency: float = labelled("Hz", "|lambda| / (2 pi)")
+    damping_ratio: float = labelled("1", "of the mode")
+    kind: str = told("what holds most of its energy: link, stretch (of links), drive, or rigid")
+    share: float = labelled("1", "of the potential energy, in that", default=np.nan)
+    links: tuple[int, ...] = told("which take part, from 1; none for other kinds", default=())
+    order: int | None = told("of the links' mode, from 1; null for other kinds", default=None)
+    platform: str | None = told("on its drive: translates or turns; null for others", default=None)
 
-    @property
+    @derived("", "the same in words, such as: link 2, mode 1, 96 %")
     def description(self) -> str:
-        """In words: "link 2, mode 1, 96 %"."""
         if self.kind == "rigid":
             return "rigid motion"
         percent = f"{100 * self.share:.0f} %"
@@ -48,8 +51,8 @@ class ModeKind(NamedTuple):
         return f"{links}, mode {self.order}, {percent}"
 
 
-class NamedModes(NamedTuple):
-    """Natural modes of the machine at a pose, ascending in frequency.
+class NamedModes(Labelled, command="modes", version=2):
+    """What `studies modes --json` prints: natural modes of the machine at a pose.
 
     `link_share` is the strain energy k_ij |q_ij|^2 in modal coordinate j of link i over the mode's
     potential energy x* K x, which in the mean over a period equals its kinetic energy;
@@ -58,44 +61,51 @@ class NamedModes(NamedTuple):
     those of K-orthogonal ones. NaN for rigid motion, which nothing holds.
     """
 
-    frequency: np.ndarray  # |lambda|/2 pi [Hz], (m,)
-    damping_ratio: np.ndarray  # [1], (m,)
-    shape: np.ndarray  # (X, q) part of the eigenvectors, largest entry 1, (n, m), one per column
-    link_share: np.ndarray  # [1], (m, 3, R), or (m, 3, R + 1) with elongations last
-    drive_share: np.ndarray  # [1], (m,)
-    turn_share: np.ndarray  # of the platform's kinetic energy that is in rotation [1], (m,)
-    has_stretch: bool = False  # links lengthen
+    frequency: np.ndarray = unwritten()  # |lambda|/2 pi, ascending [Hz], (m,)
+    damping_ratio: np.ndarray = unwritten()  # [1], (m,)
+    shape: np.ndarray = (
+        unwritten()
+    )  # (X, q) part of the eigenvectors, largest entry 1, (n, m), one per column
+    link_share: np.ndarray = unwritten()  # [1], (m, 3, R), or (m, 3, R + 1) with elongations last
+    drive_share: np.ndarray = unwritten()  # [1], (m,)
+    turn_share: np.ndarray = (
+        unwritten()
+    )  # of the platform's kinetic energy that is in rotation [1], (m,)
+    has_stretch: bool = unwritten(default=False)  # links lengthen
 
     def _repr_html_(self) -> str:
         return shown(self)
 
-    @property
-    def kinds(self) -> list[ModeKind]:
-        """What each mode is."""
-        shares = zip(self.link_share, self.drive_share, self.turn_share, strict=True)
-        return [_kind(*share, self.has_stretch) for share in shares]
+    @derived("", "ascending in frequency")
+    def modes(self) -> list[NaturalMode]:
+        shares = self.link_share, self.drive_share, self.turn_share
+        rows = zip(self.frequency, self.damping_ratio, *shares, strict=True)
+        return [
+            NaturalMode(k, float(f), float(ratio), *_kind(link, drive, turn, self.has_stretch))
+            for k, (f, ratio, link, drive, turn) in enumerate(rows, 1)
+        ]
 
     @property
     def names(self) -> list[str]:
-        """The same in words, such as "link 2, mode 1, 96 %"."""
-        return [kind.description for kind in self.kinds]
+        """Each in words, such as "link 2, mode 1, 96 %"."""
+        return [mode.description for mode in self.modes]
 
 
 def _kind(
     link_share: np.ndarray, drive_share: float, turn_share: float, has_stretch: bool
-) -> ModeKind:
+) -> tuple[Any, ...]:
+    """Kind, share, links, order and platform of `NaturalMode`."""
     if np.isnan(drive_share):
-        return ModeKind("rigid")
+        return ("rigid",)
     if drive_share > 0.5:
-        platform = "turns" if turn_share > 0.5 else "translates"
-        return ModeKind("drive", float(drive_share), platform=platform)
+        return "drive", float(drive_share), (), None, "turns" if turn_share > 0.5 else "translates"
     order = int(link_share.sum(axis=0).argmax())
     share = link_share[:, order]
     links = np.flatnonzero(share >= share.max() / 3)  # the others hardly take part
-    kind = ModeKind("link", float(share[links].sum()), tuple((links + 1).tolist()), order + 1)
+    taking_part = float(share[links].sum()), tuple((links + 1).tolist())
     if has_stretch and order == len(link_share[0]) - 1:
-        return kind._replace(kind="stretch", order=None)
-    return kind
+        return "stretch", *taking_part
+    return "link", *taking_part, order + 1
 
 
 def modes_study(

@@ -16,46 +16,22 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.delay import command_change, true_delay
 from jaxmodel.hysteresis import added_voltage, advance_plays, design_hysteresis
 from jaxmodel.loop_figures import MARGIN_MODES
-from jaxmodel.metrics import METRICS
 from jaxmodel.prepare import left_out_deflection, spectrum_frequencies
 from jaxmodel.simulate import Result
 from studies import config
-from studies.engine.columns import ON_DEMAND, PER_CASE, axis_variables
+from studies.engine.columns import RECORD, axis_variables, named
 from studies.engine.poles import PoleReport
 from studies.engine.programs import kept_jit
 from studies.engine.runs import Run
-from studies.store import Variable, axis_sizes
+from studies.results.labelled import Variable, Variables
+from studies.store import axis_sizes
 from studies.study.labels import STATUS_LABEL
 from studies.study.spec import Study
 
 
-def metric_variables(result: Result) -> dict[str, Variable]:
-    """Labelled metrics of a run."""
-    return {
-        name: Variable(np.asarray(data), METRICS[name].dims, METRICS[name].unit, METRICS[name].text)
-        for name, data in result.metrics.items()
-    }
-
-
-_RECORD_LABELS = {
-    "pose": (("time", "pose_axis"), "m; m; rad", "platform pose (x, y, phi)"),
-    "pose_error": (("time", "pose_axis"), "m; m; rad", "pose minus shaped reference"),
-    "slider": (("time", "slider_axis"), "m", "actuated coordinate rho"),
-    "modal_coordinate": (("time", "link", "mode"), "m", "modal coordinates q of the plant"),
-    "controlled_coordinate": (
-        ("time", "link", "controlled_mode"),
-        "m",
-        "controller's modes seen by an ideal modal filter",
-    ),
-    "chord_deflection_stations": (
-        ("time", "link", "station"),
-        "m",
-        "deflection relative to the chord B-C at the stations",
-    ),
-    "sensor_voltage": (("time", "link", "patch"), "V", "raw sensor voltage"),
-    "actuator_voltage": (("time", "link", "patch"), "V", "actuator voltage"),
-    "slider_force": (("time", "slider_axis"), "N", "motor force"),
-}
+def metric_variables(result: Result, *axes: str) -> dict[str, Variable]:
+    """Labelled metrics of a run, or of runs along some axes."""
+    return {name: named(name, np.asarray(data), *axes) for name, data in result.metrics.items()}
 
 
 #: Labelled as in the files of sweeps.
@@ -75,8 +51,8 @@ def _spectrum_frequencies(structure: Structure, case: Case) -> Any:
 
 def result_variables(run: Run) -> dict[str, Variable]:
     """What a run ended like: its metrics, and what its cases have in the files of sweeps."""
-    labelled = {name: Variable(getattr(run.result, name), *PER_CASE[name]) for name in _OF_RESULTS}
-    return labelled | metric_variables(run.result)
+    of_cases = {name: named(name, getattr(run.result, name)) for name in _OF_RESULTS}
+    return of_cases | metric_variables(run.result)
 
 
 def run_variables(run: Run) -> dict[str, Variable]:
@@ -94,71 +70,39 @@ def run_variables(run: Run) -> dict[str, Variable]:
         **loop_variables(run),
     }
     if run.result.record is not None:
-        record = run.result.record
-        variables["time"] = Variable(record.time, ("time",), "s", "time")
-        for name, (dims, unit, text) in _RECORD_LABELS.items():
-            variables[name] = Variable(getattr(record, name), dims, unit, text)
-        variables["chord_deflection"] = Variable(
-            chord_deflection(run), ("time", "link"), "m", "mid-span relative to the chord B-C"
-        )
+        kept = run.result.record._asdict() | {"chord_deflection": chord_deflection(run)}
+        variables |= {name: named(name, kept[name]) for name in RECORD}
     return variables | axis_variables(run.study, axis_sizes(variables))
 
 
-def loop_variables(run: Run) -> dict[str, Variable]:
+def loop_variables(run: Run) -> Variables:
     """Judgement of a run's linearised loop, its poles and its margins on the way; {} for none."""
-    variables: dict[str, Variable] = {}
-    if run.loop is not None:
-        variables |= {
-            "loop_spectral_radius": Variable(
-                np.array(run.loop.spectral_radius), (), "1", "of the linearised sampled loop"
-            ),
-            "gain_margin": Variable(
-                np.array(run.loop.gain_margin),
-                (),
-                "1",
-                f"common gain factor before instability, {MARGIN_MODES} plant modes or more",
-            ),
-            "loop_frequency": Variable(
-                run.loop.frequency_hz,
-                ("tracked_mode", "tracked_pole"),
-                "Hz",
-                "frequencies of the lowest link modes under control, three of each order",
-            ),
-            "loop_damping_ratio": Variable(
-                run.loop.damping_ratio,
-                ("tracked_mode", "tracked_pole"),
-                "1",
-                "their damping ratios",
-            ),
-        }
-        variables |= {
-            name: Variable(value, (), *ON_DEMAND[name])
-            for name, value in (run.loop.robustness or {}).items()
-        }
+    found = Variables()
+    if (loop := run.loop) is not None:
+        text = "of the linearised sampled loop"
+        found.put("loop_spectral_radius", loop.spectral_radius, "1", text)
+        text = f"common gain factor before instability, {MARGIN_MODES} plant modes or more"
+        found.put("gain_margin", loop.gain_margin, "1", text)
+        tracked = "tracked_mode", "tracked_pole"
+        text = "frequencies of the lowest link modes under control, three of each order"
+        found.put("loop_frequency", loop.frequency_hz, "Hz", text, *tracked)
+        found.put("loop_damping_ratio", loop.damping_ratio, "1", "their damping ratios", *tracked)
+        found |= {name: named(name, value) for name, value in (loop.robustness or {}).items()}
     if run.poles is not None:
         texts = ("specified", "of the nominal link's loop", "of the assembled machine's loop")
+        modes = "link", "controlled_mode"
         for name, text, pole in zip(PoleReport._fields, texts, run.poles[:3], strict=False):
-            for part, value, unit in (
-                ("decay", -pole.real, "s-1"),
-                ("frequency", np.abs(pole.imag) / (2 * np.pi), "Hz"),
-            ):
-                variables[f"{name}_pole_{part}"] = Variable(
-                    value, ("link", "controlled_mode"), unit, f"{part} of the poles {text}"
-                )
-    if run.motion is not None:
-        instants = ("instant",)
-        variables |= {
-            "motion_time": Variable(
-                run.motion.time, instants, "s", "start of the unshaped motion, and extremes of N"
-            ),
-            "motion_axial_force": Variable(
-                run.motion.axial_force, ("instant", "link"), "N", "tension N in the links then"
-            ),
-            "motion_gain_margin": Variable(
-                run.motion.gain_margin, instants, "1", "gain margin as if the instant lasted"
-            ),
-        }
-    return variables
+            found.put(f"{name}_pole_decay", -pole.real, "s-1", f"decay of the poles {text}", *modes)
+            hertz, text = np.abs(pole.imag) / (2 * np.pi), f"frequency of the poles {text}"
+            found.put(f"{name}_pole_frequency", hertz, "Hz", text, *modes)
+    if (motion := run.motion) is not None:
+        text = "start of the unshaped motion, and extremes of N"
+        found.put("motion_time", motion.time, "s", text, "instant")
+        text = "tension N in the links then"
+        found.put("motion_axial_force", motion.axial_force, "N", text, "instant", "link")
+        text = "gain margin as if the instant lasted"
+        found.put("motion_gain_margin", motion.gain_margin, "1", text, "instant")
+    return found
 
 
 def chord_deflection(run: Run) -> np.ndarray:

@@ -17,7 +17,7 @@ from jaxmodel import status
 from jaxmodel.case import Structure
 from jaxmodel.metrics import METRICS
 from studies.engine.chunks import Done
-from studies.engine.columns import PER_CASE, SCREENED, labelled
+from studies.engine.columns import PER_CASE, SCREENED, named
 from studies.engine.folder import SCREEN, Finished, finished_cases
 from studies.engine.plan import Group, Layout, plan_groups
 from studies.engine.results import SweepData, direction, meets, metric_values
@@ -115,7 +115,7 @@ def chunk_values(
         entry: a metric, or an entry of it.
     """
     arrays = chunk_arrays(table, done, [entry.partition("[")[0]])
-    variables = {name: labelled(name, data) for name, data in arrays.items()}
+    variables = {name: named(name, data, "case") for name, data in arrays.items()}
     value = metric_values(SweepData(variables, {}, spec, table), entry)
     return arrays["status"], np.asarray(value, float)
 

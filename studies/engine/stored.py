@@ -23,8 +23,8 @@ from studies.engine.columns import (
     SCREENED,
     axis_variables,
     case_variables,
-    labelled,
     mask_unused,
+    named,
 )
 from studies.engine.folder import JOINED, Finished
 from studies.errors import field_error, nearest
@@ -142,7 +142,7 @@ def gather(
     whole = slice(0, len(table))
     variables = {name: v._replace(data=v.data.read(whole)) for name, v in columns.items()}
     for name in sorted(CODES.intersection(names) - variables.keys()):
-        variables[name] = labelled(name, np.full(len(table), NOT_RUN))
+        variables[name] = named(name, np.full(len(table), NOT_RUN), "case")
     return variables
 
 
@@ -183,7 +183,7 @@ def merge(
         rest = np.where(np.isin(linear, status.FINISHED), LEFT_OUT, linear)
         code = np.where(code == NOT_RUN, rest, code)
     variables |= joined_columns(table, finished, (*PER_CASE, *METRICS))
-    variables["status"] = labelled("status", code)
+    variables["status"] = named("status", code, "case")
     variables |= axis_variables(table.study, axis_sizes(variables), table.columns)
     write_store(folder / JOINED, variables, labels)
 
@@ -219,7 +219,7 @@ def joined_columns(
     columns = {}
     for name, (shape, dtype) in _largest(finished.files, names).items():
         column = LazyArray((len(table), *shape), dtype, partial(read, name, shape, dtype))
-        columns[name] = labelled(name, column)
+        columns[name] = named(name, column, "case")
     return columns
 
 

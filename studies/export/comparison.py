@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -30,7 +30,8 @@ from studies.export.job import check_loop
 from studies.export.run import checked_bits, checked_board
 from studies.export.verify import load_code, reference_run
 from studies.publish import announce, check_folder, publish, shown, working_folder
-from studies.show.document import json_text
+from studies.results.document import json_text
+from studies.results.labelled import Labelled, derived, labelled, told, unwritten
 from studies.show.pages import page
 from studies.study.margin import margin_text
 from studies.study.spec import Study
@@ -44,40 +45,48 @@ NAME = "flexlink"
 SAFE, ALIKE = 2.0, 0.05
 
 
-class Variant(NamedTuple):
-    """A controller at a sample rate in one arithmetic."""
+class Variant(Labelled):
+    """A controller in one arithmetic at one sample rate."""
 
-    rate: float  # [Hz]
-    word: int  # bits of a word; 0: single precision
-    fault: str = ""  # why there is no such controller
-    margin: float = np.nan  # gain margin with its coefficients [1]
-    residual: float = np.nan  # rms of the worst link after the motion [m]
-    rounding: float = 0.0  # bound on the error at an actuator, in DAC steps [1]
-    instructions: int | None = None  # of the costliest sample; None: not emulated
-    load: float | None = None  # share of a sample period at the board's usual clock [1]
-    flash: int | None = None  # code and constants [bytes]
+    sample_rate: float = labelled("Hz", "of the controller")
+    word: int = told("bits of a word; 0: single precision")
+    fault: str = told("why there is no such controller; empty if there is", default="")
+    gain_margin: float = labelled("1", "with its coefficients", default=np.nan)
+    residual_rms: float = labelled("m", "of the worst link after the motion", default=np.nan)
+    rounding: float = labelled("1", "bound on the error at an actuator, in DAC steps", default=0.0)
+    instructions: int | None = told("of the costliest sample; null: not emulated", default=None)
+    load: float | None = labelled("1", "share of a sample period, usual clock", default=None)
+    flash: int | None = told("code and constants [byte]", default=None)
 
-    @property
+    @derived("", "in words")
     def arithmetic(self) -> str:
-        """In words."""
         return f"{self.word}-bit fixed point" if self.word else "single precision"
 
-    @property
+    @derived("", "whether studies export writes it")
     def is_exportable(self) -> bool:
-        """Whether `studies export` would write it."""
         return not self.fault and self.word in (0, 32) and self.rounding <= ALLOWED_ERROR
 
 
-class ComparedVariants(NamedTuple):
-    """All variants of a controller."""
+class ComparedVariants(Labelled, command="comparison", version=2):
+    """`comparison.json`, written by `studies export --compare`: a controller in several
+    arithmetics and at several sample rates.
+    """
 
-    out: Path
-    study: Study
-    motion: str  # why it is not the study's own one, "" if it is
-    board: Board | None
-    dac_bits: int
-    variants: tuple[Variant, ...]
-    uncontrolled: float  # residual vibration without control, as `Variant.residual` [m]
+    out: Path = unwritten()
+    study: Study = unwritten()
+    motion: str = told("why it is not that of the study; empty if it is")
+    board: Board | None = unwritten()
+    dac_bits: int = told("resolution of the DAC behind all of them")
+    variants: tuple[Variant, ...] = told("arithmetic by arithmetic at each sample rate")
+    uncontrolled: float = labelled("m", "residual vibration of the worst link without control")
+
+    @derived("", "of the study")
+    def title(self) -> str:
+        return self.study.title
+
+    @derived("", "that counted instructions; empty: none")
+    def processor(self) -> str:
+        return "" if self.board is None else self.board.name
 
     @property
     def is_good(self) -> bool:
@@ -139,7 +148,7 @@ def compare_variants(
     )
     with publish(out) as staging:
         (staging / PAGE).write_text(_page(found), encoding="utf-8")
-        (staging / DOCUMENT).write_text(_document(found), encoding="utf-8")
+        (staging / DOCUMENT).write_text(json_text(found), encoding="utf-8")
     announce(console, out / PAGE)
     return found
 
@@ -199,7 +208,7 @@ def _floating(at: _At, rate: float) -> Variant:
     with load_code(exported, source, NAME, at.compiler, np.float32, np.float32) as code:
         law = law_of(code, scale, through_dac)
         run = run_in_the_loop(exported.structure, exported.case, law)
-    variant = Variant(rate, 0, margin=at.margin, residual=_residual(run))
+    variant = Variant(rate, 0, gain_margin=at.margin, residual_rms=_residual(run))
     return _with_cost(at, variant, source, at.codes * scale)
 
 
@@ -216,8 +225,8 @@ def _fixed(at: _At, rate: float, word: int) -> Variant:
     variant = Variant(
         rate,
         word,
-        margin=float(loop.gain_margin),
-        residual=_residual(run),
+        gain_margin=float(loop.gain_margin),
+        residual_rms=_residual(run),
         rounding=float(fixed.error.inside.max() / wires.dac_step),
     )
     return _with_cost(at, variant, source, at.codes)
@@ -234,8 +243,8 @@ def _with_cost(at: _At, variant: Variant, source: Source, sensor: np.ndarray) ->
     with _emulation(source, at.board, bool(variant.word)) as (built, processor):
         processor.respond(sensor)
         most = int(processor.instructions[-1].max())
-    load = at.board.load(most, variant.rate, at.board.clock)
-    return variant._replace(instructions=most, load=load, flash=built.flash)
+    load = at.board.load(most, variant.sample_rate, at.board.clock)
+    return variant.replace(instructions=most, load=load, flash=built.flash)
 
 
 @contextmanager
@@ -254,7 +263,8 @@ def _verdict(x: Variant) -> str:
     """What speaks for or against a variant, in words."""
     if x.fault:
         return f"none: {x.fault}"
-    text = f"gain margin {margin_text(x.margin, 3)}, residual vibration {1e6 * x.residual:.3g} µm"
+    margin = margin_text(x.gain_margin, 3)
+    text = f"gain margin {margin}, residual vibration {1e6 * x.residual_rms:.3g} µm"
     if x.rounding > ALLOWED_ERROR:
         return f"{text}, but rounding of up to {x.rounding:.3g} DAC steps"
     return text
@@ -264,11 +274,11 @@ def _rows(found: ComparedVariants) -> list[list[str]]:
     """Row of the table of each variant."""
     rows, own = [], found.study.electronics.sample_rate_hz
     for x in found.variants:
-        start = [f"{x.rate / 1e3:g}{' (own)' if x.rate == own else ''}", x.arithmetic]
+        start = [f"{x.sample_rate / 1e3:g}{' (own)' if x.sample_rate == own else ''}", x.arithmetic]
         if x.fault:
             rows.append([*start, *[""] * (3 if found.board is None else 6), f"none: {x.fault}"])
             continue
-        figures = [margin_text(x.margin, 3), f"{1e6 * x.residual:.4g}"]
+        figures = [margin_text(x.gain_margin, 3), f"{1e6 * x.residual_rms:.4g}"]
         figures.append(f"{x.rounding:.3g}" if x.word else "no bound")
         if found.board is not None and x.load is not None:
             figures += [str(x.instructions), f"{100 * x.load:.0f} %", str(x.flash)]
@@ -283,10 +293,10 @@ def cheapest(found: ComparedVariants) -> Variant | None:
     They are exported, keep a gain margin of `SAFE`, and vibrate no more than the stillest one by
     `ALIKE`. Without a processor the one of the lowest rate, in single precision first.
     """
-    safe = [x for x in found.variants if x.is_exportable and x.margin >= SAFE]
-    least = min((x.residual for x in safe), default=np.nan)
-    able = [x for x in safe if x.residual <= (1 + ALIKE) * least and (x.load or 0.0) < 1]
-    return min(able, key=lambda x: (x.load or 0.0, x.rate, x.word), default=None)
+    safe = [x for x in found.variants if x.is_exportable and x.gain_margin >= SAFE]
+    least = min((x.residual_rms for x in safe), default=np.nan)
+    able = [x for x in safe if x.residual_rms <= (1 + ALIKE) * least and (x.load or 0.0) < 1]
+    return min(able, key=lambda x: (x.load or 0.0, x.sample_rate, x.word), default=None)
 
 
 def _advice(found: ComparedVariants) -> str:
@@ -297,7 +307,7 @@ def _advice(found: ComparedVariants) -> str:
     load = "" if best.load is None else f", {100 * best.load:.0f} % of a sample period"
     return (
         f"the cheapest with a gain margin of {SAFE:g} and at most {100 * ALIKE:.0f} % more "
-        f"vibration than the stillest is {best.arithmetic} at {best.rate / 1e3:g} kHz{load}"
+        f"vibration than the stillest is {best.arithmetic} at {best.sample_rate / 1e3:g} kHz{load}"
     )
 
 
@@ -319,30 +329,3 @@ def _page(found: ComparedVariants) -> str:
         advice=_advice(found),
         allowed=ALLOWED_ERROR,
     )
-
-
-def _document(found: ComparedVariants) -> str:
-    whole = {
-        "title": found.study.title,
-        "motion": found.motion,
-        "processor": "" if found.board is None else found.board.name,
-        "dac_bits": found.dac_bits,
-        "uncontrolled_residual_rms": found.uncontrolled,
-        "variants": [_described(x) for x in found.variants],
-    }
-    return json_text("comparison", whole)
-
-
-def _described(x: Variant) -> dict[str, Any]:
-    return {
-        "sample_rate_hz": x.rate,
-        "arithmetic": x.arithmetic,
-        "is_exportable": x.is_exportable,
-        "fault": x.fault,
-        "gain_margin": x.margin,
-        "residual_rms": x.residual,
-        "rounding": x.rounding,
-        "instructions": x.instructions,
-        "load": x.load,
-        "flash": x.flash,
-    }

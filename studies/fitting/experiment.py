@@ -22,6 +22,7 @@ from studies.errors import StudyError
 from studies.fitting.bench import Bench, Modes, PlantAt, Pose, response
 from studies.fitting.kinds.modes import mode_slopes
 from studies.fitting.spec import MODES, Next, own_signal
+from studies.results.labelled import Labelled, derived, told, unwritten
 from studies.space.free import FreeNumbers
 from studies.study.signals import PLACED, Signal, signal_name
 
@@ -37,17 +38,17 @@ COVERED = 9
 APART = 20.0
 
 
-class Experiment(NamedTuple):
+class Experiment(Labelled):
     """One measurement that could be taken."""
 
-    pose: Pose
-    text: str
-    widest: float  # standard deviation of the widest direction afterwards, between the bounds [1]
-    apart: float  # rise of chi square of the other optimum that it tells least from the best [1]
+    pose: tuple[float, ...] = told("[m, m, rad]")
+    text: str = told("in words")
+    widest: float = told("standard deviation of the widest direction then, over the bounds [1]")
+    # rise of chi square of the other optimum that it tells least from the best [1]
+    apart: float = unwritten()
 
-    @property
+    @derived("", "whether it excludes all other optima, with the measurements before it")
     def tells_apart(self) -> bool:
-        """Whether it excludes all other optima, with the measurements before it."""
         return self.apart >= APART
 
 

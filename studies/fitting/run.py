@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from rich.console import Console
 
 from studies.engine.folder import FIT
 from studies.engine.progress import Phases
 from studies.engine.run_data import run_attributes
 from studies.fitting import plots
-from studies.fitting.estimate import Fitted, estimate, fit_phases, named_values, suggest
-from studies.fitting.kinds.contract import Line
-from studies.fitting.report import is_good, report, sentences, summary, unknown_numbers
+from studies.fitting.document import fit_document, fit_variables
+from studies.fitting.estimate import Fitted, estimate, fit_phases, suggest
+from studies.fitting.report import report, summary
 from studies.fitting.spec import FitSpec
 from studies.fitting.statistics import REGION
 from studies.publish import REPORT, announce, check_folder, publish
-from studies.show.document import json_text
+from studies.results.document import json_text
 from studies.show.figures import draw
-from studies.store import Variable, write_store
+from studies.store import write_store
 from studies.study.template import study_template
 from studies.threads import serial_blas
 
@@ -55,13 +53,13 @@ def run_fit(
         with publish(out, [DOCUMENT, *images]) as staging:
             (staging / STUDY).write_text(study_template(fitted.study), encoding="utf-8")
             (staging / TUNE).write_text(_tuning(fitted), encoding="utf-8")
-            write_store(staging / DATA, variables(fitted), run_attributes(fitted.study))
+            write_store(staging / DATA, fit_variables(fitted), run_attributes(fitted.study))
             draw(staging, plots.drawings(fitted), has_pdf)
             (staging / REPORT).write_text(report(fitted, staging), encoding="utf-8")
         fitted = suggest(fitted, phases)
         with publish(out) as staging:  # only now is there a document: the answer is complete
             (staging / REPORT).write_text(report(fitted, out), encoding="utf-8")
-            (staging / DOCUMENT).write_text(document(fitted), encoding="utf-8")
+            (staging / DOCUMENT).write_text(json_text(fit_document(fitted)), encoding="utf-8")
     console.print(summary(fitted), soft_wrap=True)
     more = f"; {STUDY} is the fitted study, {TUNE} a tuning for machines like it"
     announce(console, out / REPORT, more)
@@ -110,93 +108,3 @@ def _warning(fitted: Fitted) -> str:
     return (
         "# THE MODEL DOES NOT EXPLAIN THE DATA: these machines are too much alike (see report).\n"
     )
-
-
-def document(fitted: Fitted) -> str:
-    """JSON text of the answer."""
-    answer, free = fitted.answer, fitted.spec.free
-    numbers = [
-        {
-            "name": name,
-            "value": float(answer.values[k]),
-            "sigma": float(answer.sigma[k]),
-            "interval_95": [float(x) for x in answer.interval[k]],
-        }
-        for k, name in enumerate(fitted.names)
-    ]
-    whole: dict[str, Any] = {
-        "title": fitted.spec.study.title,
-        "is_good": bool(is_good(fitted)),
-        "is_explained": bool(answer.is_explained),
-        "is_converged": bool(fitted.solution.best.is_converged),
-        "messages": sentences(fitted),
-        "chi_square": answer.chi_square,
-        "freedom": int(answer.freedom),
-        "numbers": numbers,
-        "undetermined": [
-            {fitted.names[k]: float(x.parts[k]) for k in x.named()} for x in answer.undetermined
-        ],
-        "equally_good": [
-            {"rise": fitted.solution.rise(x), "values": named_values(fitted.spec, free.values(x.u))}
-            for x in fitted.rivals
-        ],
-        "correlation": answer.correlation.tolist(),
-        "unknown": unknown_numbers(fitted),
-        "experiments": [
-            {
-                "text": x.text,
-                "pose": list(x.pose),
-                "widest": x.widest,
-                "tells_apart": x.tells_apart,
-            }
-            for x in fitted.experiments
-        ],
-        "held_out": [
-            {"name": x.name, "numbers": x.size, "chi_square": x.square, "is_noise": x.is_noise}
-            for x in fitted.checks
-        ],
-    }
-    return json_text("fit", whole)
-
-
-def variables(fitted: Fitted) -> dict[str, Variable]:
-    """Labelled numbers of a fit."""
-    answer, axis = fitted.answer, ("number",)
-    part = {
-        "number": Variable(np.array(fitted.names), axis, "1", "parameter"),
-        "value": Variable(answer.values, axis, "1", "fitted, in the field's unit"),
-        "sigma": Variable(answer.sigma, axis, "1", "standard deviation, in the field's unit"),
-        "interval": Variable(answer.interval, (*axis, "end"), "1", "95 %, in the field's unit"),
-        "machine": Variable(
-            fitted.machines, ("machine", "number"), "1", "machines that the data leave possible"
-        ),
-        "optimum": Variable(
-            fitted.spec.free.values(np.stack([x.u for x in fitted.solution.optima])),
-            ("optimum", "number"),
-            "1",
-            "optima, the best first, in the field's unit",
-        ),
-        "optimum_rise": Variable(
-            np.array([fitted.solution.rise(x) for x in fitted.solution.optima]),
-            ("optimum",),
-            "1",
-            "rise of chi square from the best optimum",
-        ),
-        "correlation": Variable(answer.correlation, (*axis, "other"), "1", "of the numbers"),
-    }
-    if fitted.posterior is not None:
-        part["sample"] = Variable(
-            fitted.posterior.values, ("draw", *axis), "1", "posterior, in the field's unit"
-        )
-    for k, (name, _, one) in enumerate(fitted.comparisons):
-        point = (f"point_{k}",)
-        if isinstance(one, Line):
-            x, unit = Variable(one.x, point, "1", one.abscissa), one.ordinate
-        else:
-            x, unit = Variable(np.array(one.labels), point, "1", "number"), "in its unit"
-        part |= {
-            f"x_{k}": x,
-            f"measured_{k}": Variable(one.measured, point, "1", f"{name}: {unit}"),
-            f"model_{k}": Variable(one.model, point, "1", f"{name}: {unit}"),
-        }
-    return part

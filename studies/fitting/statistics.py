@@ -15,6 +15,7 @@ import scipy
 from studies.fitting.kinds.contract import Measurement, Residual
 from studies.fitting.problem import Problem
 from studies.fitting.solve import Optimum, Solution
+from studies.results.labelled import Labelled, told
 
 #: Standard deviation of a number of which only the bounds are known [1].
 UNKNOWN = 1 / np.sqrt(12)
@@ -51,15 +52,15 @@ SHORT = 0.05
 INDEPENDENT = 0.1
 
 
-class Misfit(NamedTuple):
+class Misfit(Labelled):
     """How well one measurement is met."""
 
-    name: str
-    size: int  # residuals
-    square: float  # their sum of squares
-    autocorrelation: float  # of neighbours: correlation [1]; 0 for noise, nan if they have no order
-    is_noise: bool  # whether the residuals look like the stated noise
-    is_correlated: bool  # no larger than the stated noise, but neighbours are alike
+    name: str = told("of the measurement")
+    size: int = told("residuals")
+    square: float = told("their sum of squares")
+    autocorrelation: float = told("of neighbours; 0 for noise, null if they have no order")
+    is_noise: bool = told("whether the residuals look like the stated noise")
+    is_correlated: bool = told("no larger than the stated noise, but neighbours are alike")
 
     @property
     def thin(self) -> int:

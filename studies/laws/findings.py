@@ -18,6 +18,7 @@ from studies.laws.judging import FIGURES, MOVES, Judged, changes
 from studies.laws.ranking import RESAMPLES, Ranking, geometric_mean, rank
 from studies.laws.tuning import Budget, Tuned
 from studies.publish import shown
+from studies.results.labelled import Labelled, told, unwritten
 from studies.study.entries import controlled_links
 from studies.study.margin import ENOUGH, margin_text
 from studies.study.paths import set_values
@@ -31,15 +32,15 @@ TOLERANCE = 1.01
 GIVEN, WITHOUT = "the design as given", "without control"
 
 
-class Combination(NamedTuple):
+class Combination(Labelled):
     """A controller to compare."""
 
-    name: str  # in tables
-    law: str  # name of its candidate, "" for what was given
-    drive: str  # the same
-    study: Study
-    reason: str  # why it is out of the competition, "" if it is not
-    n_free: int  # numbers it was tuned by
+    name: str = told("in tables")
+    law: str = told("name of its candidate, empty for what was given")
+    drive: str = told("the same")
+    study: Study = unwritten()
+    reason: str = told("why it is not ranked, empty if it is")
+    n_free: int = told("numbers it was tuned by")
 
 
 class LawFindings(NamedTuple):
@@ -177,7 +178,7 @@ def _with_stability(entry: Combination, margin: np.ndarray) -> Combination:
     if not count:
         return entry
     text = f"unstable on {count} of {len(margin)} machines"
-    return entry._replace(reason="; ".join(filter(None, (entry.reason, text))))
+    return entry.replace(reason="; ".join(filter(None, (entry.reason, text))))
 
 
 def verdict(findings: LawFindings) -> list[str]:

@@ -27,6 +27,7 @@ from studies.engine.runs import resolved_study
 from studies.errors import field_error
 from studies.laws import plots
 from studies.laws.candidates import drive_candidates, law_candidates
+from studies.laws.document import laws_document
 from studies.laws.findings import (
     GIVEN,
     WITHOUT,
@@ -38,9 +39,11 @@ from studies.laws.findings import (
 )
 from studies.laws.judging import judging_sweep, read_judged
 from studies.laws.machines import machines_of, with_noise
-from studies.laws.report import document, report
+from studies.laws.report import report
 from studies.laws.tuning import Budget, Tuned, make_budget, tune_candidate
 from studies.publish import REPORT, publish
+from studies.results.document import json_text
+from studies.results.labelled import document
 from studies.show.figures import draw
 from studies.show.sketch import sketch
 from studies.space.spec import SweepSpec
@@ -88,8 +91,8 @@ def run_laws(
     budget = make_budget(study, voltage, margin)
     with locked_folder(out, "comparison"):
         refuse_existing(out, COMPARISONS, is_resumed)
-        request = make_manifest(study.model_dump(mode="json"), DECISIVE) | budget._asdict()
-        limits = dict.fromkeys(Budget._fields, "budget")
+        request = make_manifest(study.model_dump(mode="json"), DECISIVE) | document(budget)
+        limits = dict.fromkeys(document(budget), "budget")
         checked = {"spec": "design", "code": "program"} | limits
         keep_request(out / COMPARISONS.mark, request, checked)
         names = ("tune", *sweep_phases(_empty_sweep(study)), "rank", "draw")
@@ -189,7 +192,7 @@ def _write(findings: LawFindings, out: Path) -> None:
             title = f"{findings.study.title or 'study'}: {controller.name}"[:200]
             named = controller.study.model_copy(update={"title": title})
             file.write_text(study_template(named), encoding="utf-8")
-        (staging / DOCUMENT).write_text(document(findings), encoding="utf-8")
+        (staging / DOCUMENT).write_text(json_text(laws_document(findings)), encoding="utf-8")
         drawings = {"laws": plots.comparison, "grid": plots.grid}
         draw(staging, {name: partial(plot, findings) for name, plot in drawings.items()})
         draw(staging, {"machine": partial(sketch, findings.study)})

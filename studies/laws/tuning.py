@@ -17,6 +17,7 @@ from studies.engine.runs import run_study
 from studies.errors import StudyError, field_error
 from studies.laws.candidates import Contender
 from studies.laws.machines import machines_of
+from studies.results.labelled import Labelled, labelled, told
 from studies.study.labels import describe
 from studies.study.spec import Study
 from studies.tuning.check import tuned_study
@@ -33,15 +34,15 @@ AGREE = 0.05
 LATE = 5
 
 
-class Budget(NamedTuple):
+class Budget(Labelled):
     """What every candidate may spend."""
 
-    voltage: float  # largest of an actuator [V]
-    margin: float  # least disk margin [1]
-    starts: int = 4
-    iterations: int = 20
-    machines: int = 2  # of a tuning, the design's own among them
-    seed: int = 0
+    voltage: float = labelled("V", "largest of an actuator")
+    margin: float = labelled("1", "least disk margin")
+    starts: int = told("starting points of a tuning", default=4)
+    iterations: int = told("from each", default=20)
+    machines: int = told("of a tuning, the design's own among them", default=2)
+    seed: int = told("of machines and resamplings", default=0)
 
 
 def make_budget(study: Study, voltage: float | None, margin: float) -> Budget:
@@ -72,13 +73,13 @@ def make_budget(study: Study, voltage: float | None, margin: float) -> Budget:
     return Budget(float(voltage), margin)
 
 
-class Quality(NamedTuple):
+class Quality(Labelled):
     """What says whether a tuning found the best numbers."""
 
-    objective: float  # over that of the design as given, on the machines of the tuning [1]
-    n_alike: int  # starting points that end within AGREE of the best one, itself included
-    late_gain: float  # share by which LATE iterations improved the best one [1]; nan if unknown
-    at_bound: tuple[str, ...]  # numbers that end at one of their bounds
+    objective: float = labelled("1", "over that of the design as given, on the tuning's machines")
+    n_alike: int = told("starting points that agree with the best one, itself included")
+    late_gain: float = labelled("1", "share by which the last iterations improved the best one")
+    at_bound: tuple[str, ...] = told("numbers that end at one of their bounds")
 
 
 class Tuned(NamedTuple):

@@ -13,6 +13,7 @@ from typing import NamedTuple
 from matplotlib.figure import Figure
 
 from studies.engine.batches import ProgressCallback
+from studies.results.labelled import Labelled, told
 from studies.show.listing import Rows
 from studies.store import Variable
 from studies.study.spec import Study
@@ -20,25 +21,37 @@ from studies.study.spec import Study
 HOLDS, FAILS = "holds", "fails"
 
 
-class Claim(NamedTuple):
+class Claim(Labelled):
     """One statement of a paper, in our words, and what decides it."""
 
-    text: str
-    quantity: str  # what is measured, with its unit
-    condition: str  # on that quantity
+    text: str = told("in our words")
+    quantity: str = told("what decides it, with its unit")
+    condition: str = told("on that quantity")
 
 
-class Verdict(NamedTuple):
+class Verdict(Labelled):
     """Outcome of a claim: `HOLDS` or `FAILS`."""
 
-    claim: Claim
-    outcome: str
-    found: str  # the numbers that decide
+    claim: Claim = told("what the paper says")
+    outcome: str = told("holds or fails")
+    found: str = told("the numbers that decide")
 
     @property
     def cells(self) -> list[str]:
         """A row of the table of claims."""
-        return [*self.claim, self.outcome, self.found]
+        claim = self.claim
+        return [claim.text, claim.quantity, claim.condition, self.outcome, self.found]
+
+
+class PaperOutcome(Labelled, command="paper", version=2):
+    """`claims.json` of `studies paper NAME`: what a paper claims, and what became of it."""
+
+    card: str = told("first author and year")
+    title: str = told("of the paper")
+    source: str = told("where it appeared")
+    read: str = told("what of it could be read")
+    claims: list[Verdict] = told("in their order")
+    left_open: tuple[str, ...] = told("numbers that the paper does not give")
 
 
 def outcome_of(is_met: bool) -> str:

@@ -13,10 +13,10 @@ from rich.table import Column, Table
 from studies import config
 from studies.engine.batches import ProgressCallback
 from studies.engine.run_data import run_attributes
-from studies.papers.card import CardResult, PaperCard
+from studies.papers.card import CardResult, PaperCard, PaperOutcome
 from studies.papers.catalogue import find_card
 from studies.publish import REPORT, announce, check_folder, publish
-from studies.show.document import json_text
+from studies.results.document import json_text
 from studies.show.figures import draw
 from studies.show.listing import Rows
 from studies.show.sketch import sketch
@@ -75,7 +75,7 @@ def _write(
             write_store(staging / f"{name}.h5", variables, run_attributes(study))
         for name, rows in result.tables.items():
             _write_csv(staging / f"{name}.csv", rows)
-        (staging / CLAIMS).write_text(json_text("paper", _document(card, result)), "utf-8")
+        (staging / CLAIMS).write_text(json_text(_document(card, result)), "utf-8")
         on_progress("writing data", 1.0)
         for name, drawing in result.figures.items():
             on_progress(f"drawing {name}", DRAWING)
@@ -89,19 +89,15 @@ def _write_csv(path: Path, rows: Rows) -> None:
         csv.writer(file).writerows([rows.heads, *rows.rows])
 
 
-def _document(card: PaperCard, result: CardResult) -> dict[str, object]:
-    """What `claims.json` says."""
-    return {
-        "card": card.name,
-        "title": card.title,
-        "source": card.source,
-        "read": card.read,
-        "claims": [
-            {**one.claim._asdict(), "outcome": one.outcome, "found": one.found}
-            for one in result.verdicts
-        ],
-        "left_open": card.left_open,
-    }
+def _document(card: PaperCard, result: CardResult) -> PaperOutcome:
+    return PaperOutcome(
+        card=card.name,
+        title=card.title,
+        source=card.source,
+        read=card.read,
+        claims=result.verdicts,
+        left_open=card.left_open,
+    )
 
 
 def _print_outcome(result: CardResult, out: Path, console: Console) -> None:

@@ -11,12 +11,13 @@ import numpy as np
 from studies.engine.folder import keep_request, make_manifest
 from studies.errors import StudyError
 from studies.publish import REPORT, replacing
+from studies.results.labelled import Variables
 from studies.screen.shards import CANDIDATES, ScreenRequest
 from studies.screen.tally import BUCKETS, GROWTH, LEAST, N_ENDINGS, Tally, nothing
 from studies.space.axes import LABELS
 from studies.space.spec import SPREADING
 from studies.space.table import CaseTable, as_python
-from studies.store import Variable, numbers_digest, read_store, write_store
+from studies.store import numbers_digest, read_store, write_store
 from studies.study.template import toml_text, toml_value
 
 REQUEST, TALLY, BEST = "screen.json", "screen.h5", "best.toml"
@@ -111,25 +112,23 @@ def write_tally(folder: Path, screen: ScreenRequest, is_done: np.ndarray, tally:
     """
     lower = LEAST * GROWTH ** np.arange(BUCKETS)
     names = ["all", *_interval_names(screen)]
-    variables = {
-        "is_done": Variable(is_done, ("shard",), "1", "whether a shard is in the tally"),
-        "endings": Variable(tally.endings, ("ending",), "1", "designs by status code"),
-        "row": Variable(tally.row, ("place",), "1", "number of a candidate, best first"),
-        "value": Variable(tally.value, ("place",), "SI", f"{screen.entry} there"),
-        "sketch": Variable(tally.sketch, ("part", "bucket"), "1", "designs by value"),
-        "part": Variable(np.array(names), ("part",), "1", "which designs: interval of an axis"),
-        "bucket": Variable(lower, ("bucket",), "SI", "least value in it; smaller ones: the first"),
-        "ending": Variable(
-            np.arange(N_ENDINGS), ("ending",), "1", "status code; the last one: left out by where"
-        ),
-    }
+    found = Variables()
+    found.put("is_done", is_done, "1", "whether a shard is in the tally", "shard")
+    found.put("endings", tally.endings, "1", "designs by status code", "ending")
+    found.put("row", tally.row, "1", "number of a candidate, best first", "place")
+    found.put("value", tally.value, "SI", f"{screen.entry} there", "place")
+    found.put("sketch", tally.sketch, "1", "designs by value", "part", "bucket")
+    found.put("part", names, "1", "which designs: interval of an axis", "part")
+    found.put("bucket", lower, "SI", "least value in it; smaller ones: the first", "bucket")
+    text = "status code; the last one: left out by where"
+    found.put("ending", np.arange(N_ENDINGS), "1", text, "ending")
     attributes = {
         "title": screen.spec.study.title,
         "by": screen.by,
         "n_designs": screen.n_designs,
         "digest": _digest(screen, is_done, tally),
     }
-    write_store(folder / TALLY, variables, attributes)
+    write_store(folder / TALLY, found, attributes)
 
 
 def _interval_names(screen: ScreenRequest) -> list[str]:

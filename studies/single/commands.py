@@ -13,7 +13,7 @@ from rich.table import Table
 from studies.config import start
 from studies.errors import field_error
 from studies.publish import announce
-from studies.show.document import AsJson, print_document
+from studies.results.document import AsJson, print_document
 
 if TYPE_CHECKING:
     from studies.engine.runs import Run
@@ -47,7 +47,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if as_json:
             from studies.single.documents import run_document
 
-            print_document("simulate", run_document(run, uncontrolled_twin(run)))
+            print_document(run_document(run, uncontrolled_twin(run)))
         else:
             _print_run(run, uncontrolled_twin(run), console)
             _print_files(out, report, console)
@@ -106,7 +106,6 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         """Natural frequencies and damping ratios of the assembled machine."""
         start()
         from studies.engine.modes import machine_modes
-        from studies.single.documents import modes_document
         from studies.study.spec import load_study
 
         result = machine_modes(
@@ -119,18 +118,17 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             basis=basis,
             n_modes=n_modes,
         )
-        document = modes_document(result)
         if as_json:
-            print_document("modes", document)
+            print_document(result)
             return
         if study is None:
             console.print(
                 "the paper's machine without damping; with it: studies modes paper", soft_wrap=True
             )
         table = Table("mode", "frequency [Hz]", "damping ratio [1]", "share of its energy")
-        for row in document["modes"]:
-            numbers = f"{row['frequency_hz']:.4f}", f"{row['damping_ratio']:.5f}"
-            table.add_row(str(row["mode"]), *numbers, row["description"])
+        for row in result.modes:
+            numbers = f"{row.frequency:.4f}", f"{row.damping_ratio:.5f}"
+            table.add_row(str(row.mode), *numbers, row.description)
         console.print(table)
 
     @app.command()

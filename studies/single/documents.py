@@ -1,37 +1,53 @@
-"""JSON documents of one study: its run, and its natural modes."""
+"""The JSON document of one run."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from studies.engine.modes import NamedModes
 from studies.engine.run_data import loop_variables, result_variables
 from studies.engine.runs import Run
-from studies.store import Variable
+from studies.results.labelled import Labelled, Variable, labelled, told
 from studies.study.labels import describe
 
 #: Axis of metrics that are curves: the files of runs have them.
 _CURVE = "spectrum_point"
 
 
-def run_document(run: Run, twin: Run | None) -> dict[str, Any]:
-    """What `studies simulate` says; twin: the same run without control, None if nothing acts."""
+class RunDocument(Labelled, command="simulate"):
+    """What `studies simulate --json` prints: how one run ended. Metrics of links are lists: `axes`
+    names the levels of nesting.
+    """
+
+    title: str = told("of the study")
+    status: int = told("code, as in files")
+    status_text: str = told("the same in words")
+    metrics: dict[str, Any] = told("metrics and condition numbers by name, in SI units")
+    without_control: dict[str, Any] | None = told("the same without control; null: there is none")
+    loop: dict[str, Any] | None = told("the linearised sampled loop; null: there is none")
+    breaking: str = told("what goes unstable beyond the gain margin; empty if nothing does")
+    residual_delay: float = labelled("s", "from the end of the reference to the residual window")
+    residual_length: float = labelled("s", "of the residual window")
+    units: dict[str, str] = told("SI symbol of each number by its name, 1 for none")
+    axes: dict[str, tuple[str, ...]] = told("of each number, outermost first; none for one number")
+
+
+def run_document(run: Run, twin: Run | None) -> RunDocument:
+    """The document of a run; twin: the same run without control, None if nothing acts."""
     metrics, loop = _short(result_variables(run)), loop_variables(run)
-    free = None if twin is None else _values(_short(result_variables(twin)))
-    labelled, windows = metrics | loop, run.case.windows
-    return {
-        "title": run.study.title,
-        "status": run.status,
-        "status_text": describe(run.status),
-        "metrics": _values(metrics),
-        "without_control": free,
-        "loop": _values(loop) if loop else None,
-        "breaking": (run.loop.breaking or "") if run.loop else "",
-        "residual_delay": float(windows.residual_delay),
-        "residual_length": float(windows.residual_length),
-        "units": {name: variable.units for name, variable in labelled.items()},
-        "axes": {name: variable.dims for name, variable in labelled.items()},
-    }
+    labelled_numbers, windows = metrics | loop, run.case.windows
+    return RunDocument(
+        title=run.study.title,
+        status=int(run.status),
+        status_text=describe(run.status),
+        metrics=_values(metrics),
+        without_control=None if twin is None else _values(_short(result_variables(twin))),
+        loop=_values(loop) if loop else None,
+        breaking=(run.loop.breaking or "") if run.loop else "",
+        residual_delay=float(windows.residual_delay),
+        residual_length=float(windows.residual_length),
+        units={name: variable.units for name, variable in labelled_numbers.items()},
+        axes={name: variable.dims for name, variable in labelled_numbers.items()},
+    )
 
 
 def _short(variables: dict[str, Variable]) -> dict[str, Variable]:
@@ -40,17 +56,3 @@ def _short(variables: dict[str, Variable]) -> dict[str, Variable]:
 
 def _values(variables: dict[str, Variable]) -> dict[str, Any]:
     return {name: variable.data for name, variable in variables.items()}
-
-
-def modes_document(found: NamedModes) -> dict[str, Any]:
-    """What `studies modes` says."""
-    rows = zip(found.frequency, found.damping_ratio, found.kinds, strict=True)
-    return {
-        "modes": [
-            {"mode": k, "frequency_hz": frequency, "damping_ratio": ratio}
-            | kind._asdict()
-            | {"description": kind.description}
-            for k, (frequency, ratio, kind) in enumerate(rows, 1)
-        ],
-        "units": {"frequency_hz": "Hz", "damping_ratio": "1", "share": "1"},
-    }

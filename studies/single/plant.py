@@ -21,7 +21,7 @@ from studies.engine.programs import kept_jit
 from studies.engine.runs import resolved_study
 from studies.errors import field_error
 from studies.publish import replacing
-from studies.show.document import plain
+from studies.results.labelled import plain
 from studies.study.spec import Study
 from studies.study.state_space import FORMATS
 

@@ -2,73 +2,98 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from jaxmodel.beam import BASES
 from jaxmodel.controller import channel_parts, linear_parts
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
-from studies.engine.breaking import BreakingChange
 from studies.engine.controller import FixedController, fixed_controller
 from studies.engine.host_loop import SampledLoop, name_motion
 from studies.engine.stability import LoopFigures, judge_loop, worst_figures
 from studies.errors import StudyError, field_error
 from studies.publish import shown
+from studies.results.breaking import BreakingChange
+from studies.results.labelled import Labelled, Records, derived, labelled, told, unwritten
 from studies.spillover.fast_move import ControlEffect
 from studies.spillover.plants import (
     MISMATCHES,
     LoopBuilder,
     ModelMismatch,
-    PlantVariant,
     all_plants,
     pad_channels,
     plant_sizes,
 )
-from studies.spillover.proofs import Proofs
-from studies.study.margin import hysteresis_text
+from studies.spillover.proofs import Proofs, machine_text
+from studies.study.margin import hysteresis_text, margin_text
 from studies.study.spec import Study
 from studies.threads import serial_blas
 
+#: An array of texts.
+Texts: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.str_]]
 #: Gain factors at which modes are traced from no control to the design's gains.
 STEPS = np.linspace(0, 1, 17)[1:]
 #: Share of its damping that an uncontrolled mode may lose before it is named [1].
 SPILLOVER = 0.1
 
 
-class Spillover(NamedTuple):
+class Spillover(Labelled):
     """An uncontrolled mode that control makes worse."""
 
-    mode: int  # from 1
-    damping_ratio: float  # [1]
-    free_damping: float  # without control [1]
-    plant: PlantVariant
+    mode: int = told("from 1")
+    damping_ratio: float = told("under control [1]")
+    free_damping: float = told("without control [1]")
+    basis: str = told("of the plant")
+    n_modes: int = told("of the plant, per link")
+    mismatch: str = told("from the nominal model")
 
 
-class Certificate(NamedTuple):
-    """The findings. Axes: B bases, D mismatches, N numbers of modes.
+#: Axes of what each plant has, and of what each of its modes has.
+_PLANTS = ("basis", "mismatch", "plant_modes")
+_MODES = (*_PLANTS, "link_mode", "pole")
 
-    Numbers of plants that do not exist (patches overlap, ...) are NaN, their texts "".
+
+class Certificate(Labelled, command="spillover", version=4):
+    """`certificate.json`, written by `studies spillover`: the verdict on a controller, and every
+    plant that it was judged on.
+
+    Axes: B bases, D mismatches, N numbers of modes. Numbers of plants that do not exist (patches
+    overlap, ...) are NaN, their texts "".
     """
 
-    study: Study
-    required: float  # margin required on every plant [1]
-    n_controlled: int  # r_c, controlled modes per link
-    plants: np.ndarray  # `Plant`, (B, D, N)
-    exists: np.ndarray  # (B, D, N)
-    radius: np.ndarray  # spectral radius at the design's gains [1], (B, D, N)
-    margin: np.ndarray  # largest common gain factor, all smaller ones stable [1], (B, D, N)
-    frequency_hz: np.ndarray  # of each link mode, three of each order, (B, D, N, R, 3)
-    damping_ratio: np.ndarray  # [1], (B, D, N, R, 3)
-    free_damping: np.ndarray  # without control [1], (B, D, N, R, 3)
-    weakest: np.ndarray  # the mode of least damping, in words, (B, D, N)
-    breaking: np.ndarray  # what goes unstable beyond the margin, in words, (B, D, N)
-    observation: np.ndarray  # channel signal per plant mode, (B, D, 3, C, R), see `SpilloverGains`
-    actuation: np.ndarray  # modal force per channel force, (B, D, 3, R, C)
-    notes: tuple[str, ...]  # what was left out, and why
-    proofs: Proofs | None = None  # beyond these plants, if they were asked for
-    smallest_change: BreakingChange | None = None  # that breaks the design; None: not looked for
-    fast_move: ControlEffect | None = None  # of the nominal machine; None: not run
+    ROWS = Records("plants", _PLANTS, "every plant that it was judged on", "exists")
+
+    study: Study = told("complete, as a study file holds it")
+    required_margin: float = labelled("1", "gain margin required")
+    n_controlled: int = unwritten()  # r_c, controlled modes per link
+    variants: np.ndarray = unwritten()  # `PlantVariant`, (B, D, N)
+    exists: np.ndarray = unwritten()  # (B, D, N)
+    spectral_radius: np.ndarray = labelled("1", "of the loop at its own gains", *_PLANTS)
+    gain_margin: np.ndarray = labelled("1", "common gain factor before instability", *_PLANTS)
+    frequency: np.ndarray = labelled("Hz", "of link modes, three of each order", *_MODES)
+    damping_ratio: np.ndarray = labelled("1", "their damping ratios", *_MODES)
+    free_damping_ratio: np.ndarray = labelled("1", "without control", *_MODES)
+    least_damped: Texts = labelled("1", "mode of least damping", *_PLANTS)
+    broken_by: Texts = labelled("1", "what goes unstable beyond the margin", *_PLANTS)
+    observation: np.ndarray = labelled(
+        "1",
+        "channel signal per modal coordinate of the plant (SRF: V/m)",
+        *(*_PLANTS[:2], "link", "channel", "link_mode"),
+        is_in_document=False,
+    )
+    actuation: np.ndarray = labelled(
+        "1",
+        "modal force on the plant per force of a channel (SRF: N/V)",
+        *(*_PLANTS[:2], "link", "link_mode", "channel"),
+        is_in_document=False,
+    )
+    notes: tuple[str, ...] = told("what was left out, and why")
+    proofs: Proofs | None = told("what was proven with --prove, null without", default=None)
+    smallest_change: BreakingChange | None = told(
+        "that breaks it; null: not looked for", default=None
+    )
+    fast_move: ControlEffect | None = told("of the nominal machine; null: none", default=None)
 
     def _repr_html_(self) -> str:
         return shown(self)
@@ -80,59 +105,120 @@ class Certificate(NamedTuple):
         least = finite.min(axis=(3, 4))
         return np.where(np.isfinite(least), least, np.nan)
 
-    @property
-    def passes(self) -> np.ndarray:
-        """Which plants are stable with the required margin, (B, D, N)."""
-        return (self.radius <= 1 + RADIUS_TOLERANCE) & (self.margin >= self.required)
+    @derived("", "of the study")
+    def title(self) -> str:
+        return self.study.title
+
+    @derived("1", "modal basis of the plant", "basis")
+    def basis(self) -> Texts:
+        return np.array([plant.basis for plant in self.variants[:, 0, 0]])
+
+    @derived("1", "mismatch from the nominal model", "mismatch")
+    def mismatch(self) -> Texts:
+        return np.array([str(one) for one in self._mismatches])
+
+    @derived("1", "true over nominal length of sensors", "mismatch")
+    def sensor_factor(self) -> np.ndarray:
+        return np.array([one.sensor for one in self._mismatches])
+
+    @derived("1", "true over nominal length of actuators", "mismatch")
+    def actuator_factor(self) -> np.ndarray:
+        return np.array([one.actuator for one in self._mismatches])
+
+    @derived("1", "true over nominal frequencies of the links", "mismatch")
+    def frequency_factor(self) -> np.ndarray:
+        return np.array([one.frequency for one in self._mismatches])
+
+    @derived("kg m2", "true J_C of each link", "mismatch", "link")
+    def joint_inertia_c(self) -> np.ndarray:
+        own, study = self.study.link.joint_inertia_c, self.study
+        inertia = [own if d.joint_inertia is None else d.joint_inertia for d in self._mismatches]
+        return np.array([study.each_link(x) for x in inertia])
 
     @property
+    def _mismatches(self) -> list[ModelMismatch]:
+        return [plant.mismatch for plant in self.variants[0, :, 0]]
+
+    @derived("1", "per link", "plant_modes")
+    def plant_modes(self) -> np.ndarray[tuple[int], np.dtype[np.int_]]:
+        return np.array([plant.n_modes for plant in self.variants[0, 0]])
+
+    @derived("1", "stable with the margin required", *_PLANTS)
+    def passes(self) -> np.ndarray[tuple[int, int, int], np.dtype[np.bool_]]:
+        is_stable = self.spectral_radius <= 1 + RADIUS_TOLERANCE
+        return np.asarray(is_stable & (self.gain_margin >= self.required_margin))
+
+    @derived(
+        "",
+        "whether all plants pass, and proofs found no unstable machine; what they leave "
+        "undecided does not fail a design",
+    )
     def is_passed(self) -> bool:
-        """Whether all of them do, and proofs found no unstable machine.
-
-        What proofs leave undecided does not fail a design.
-        """
         return bool(self.passes[self.exists].all()) and self.unstable_machine is None
+
+    @derived("", "passed or failed, and the deciding plant or machine")
+    def verdict(self) -> str:
+        at, machine = self.worst, self.unstable_machine
+        breaking = self.broken_by[at]
+        margin = (
+            f"gain margin {margin_text(self.gain_margin[at], 3)}, {self.required_margin:g} required"
+        )
+        if self.is_passed:
+            first = f"; first to go unstable beyond it: {breaking}" if breaking else ""
+            return f"passed: {margin}{first}"
+        unstable = (
+            "" if machine is None else f"unstable machine in the box: {machine_text(machine)}"
+        )
+        if self.fails_from == 0:
+            return f"failed by an {unstable}; on the plants: {margin}"
+        state = "" if self.spectral_radius[at] <= 1 + RADIUS_TOLERANCE else "unstable, "
+        return f"failed by {breaking}: {state}{margin}{unstable and f'; {unstable}'}"
+
+    @derived("", "least gain margin of all plants [1]")
+    def smallest_margin(self) -> float:
+        return float(np.nanmin(self.gain_margin))
 
     @property
     def unstable_machine(self) -> tuple[float, float, float] | None:
         """The one that proofs found: factor on stiffness [1], delay [samples], payload [kg]."""
         return None if self.proofs is None else self.proofs.box.unstable
 
-    @property
+    @derived("", "the uncontrolled mode of any plant that loses most damping, if more than a tenth")
     def spillover(self) -> Spillover | None:
-        """The uncontrolled mode of any plant that loses most damping, if more than a tenth."""
         kept = np.where(
-            self.exists[..., None, None], self.damping_ratio / self.free_damping, np.nan
+            self.exists[..., None, None], self.damping_ratio / self.free_damping_ratio, np.nan
         )
         kept = kept[:, :, :, self.n_controlled :]
         if np.isnan(kept).all() or np.nanmin(kept) > 1 - SPILLOVER:
             return None
         *plant, mode, _ = at = np.unravel_index(np.nanargmin(kept), kept.shape)
         whole = (*plant, mode + self.n_controlled, at[-1])
+        worst = self.variants[tuple(plant)]
         return Spillover(
             mode=int(mode) + self.n_controlled + 1,
             damping_ratio=float(self.damping_ratio[whole]),
-            free_damping=float(self.free_damping[whole]),
-            plant=self.plants[tuple(plant)],
+            free_damping=float(self.free_damping_ratio[whole]),
+            basis=worst.basis,
+            n_modes=worst.n_modes,
+            mismatch=str(worst.mismatch),
         )
 
     @property
     def worst(self) -> tuple[int, ...]:
         """Where the margin is smallest; if nearly equal, the plant with the fewest modes."""
-        near = np.argwhere(self.margin <= np.nanmin(self.margin) * (1 + 1e-3))
+        near = np.argwhere(self.gain_margin <= np.nanmin(self.gain_margin) * (1 + 1e-3))
         return tuple(int(k) for k in min(near.tolist(), key=lambda at: at[2]))
 
     @property
     def truncation(self) -> float:
         """Largest change of a margin by the last plant modes added, as a share of it [1]."""
-        last, before = self.margin[:, :, -1], self.margin[:, :, -2:][:, :, 0]
+        last, before = self.gain_margin[:, :, -1], self.gain_margin[:, :, -2:][:, :, 0]
         is_there = self.exists[:, :, -2:].all(axis=2) & (last > 0)
         return float(np.max(np.abs(before / last - 1)[is_there], initial=0.0))
 
-    @property
+    @derived("", "fewest plant modes per link with which a plant fails, 0 if none does")
     def fails_from(self) -> int:
-        """Fewest plant modes per link with which a plant fails, 0 if none does."""
-        failing = self.plants[self.exists & ~self.passes]
+        failing = self.variants[self.exists & ~self.passes]
         return min((plant.n_modes for plant in failing), default=0)
 
 
@@ -267,17 +353,17 @@ def _certificate(
     left_out = [f"left out: {fault}" for fault in faults.ravel() if fault]
     return Certificate(
         study=design.study,
-        required=margin,
+        required_margin=margin,
         n_controlled=design.structure.n_controlled,
-        plants=plants,
+        variants=plants,
         exists=exists,
-        radius=radius,
-        margin=limit,
-        frequency_hz=frequency,
+        spectral_radius=radius,
+        gain_margin=limit,
+        frequency=frequency,
         damping_ratio=zeta,
-        free_damping=free,
-        weakest=weakest.astype(str),
-        breaking=breaking.astype(str),
+        free_damping_ratio=free,
+        least_damped=weakest.astype(str),
+        broken_by=breaking.astype(str),
         observation=observation,
         actuation=actuation,
         notes=tuple(filter(None, dict.fromkeys([hysteresis_text(width), *left_out]))),

@@ -2,32 +2,41 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import jax
 import numpy as np
 
 from jaxmodel.case import Case, Structure, uncontrolled
-from jaxmodel.simulate import Result, simulate
+from jaxmodel.simulate import Result as RunResult
+from jaxmodel.simulate import simulate
 from studies.engine.fast_motion import make_fast
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
+from studies.results.labelled import Labelled, derived, labelled, unwritten
+from studies.study.labels import STATUS_LABEL, describe
 from studies.study.spec import Study
 
 
-class ControlEffect(NamedTuple):
+class ControlEffect(Labelled):
     """Residual vibration after the fast move; first with control, then without."""
 
-    study: Study  # the design's first move made fast
-    residual_rms: np.ndarray  # worst station of each link [m], (2, 3)
-    status: np.ndarray  # of the runs, codes of `jaxmodel.status`, (2,)
+    study: Study = unwritten()  # the design's first move made fast
+    residual_rms: np.ndarray = labelled("m", "worst station after the fast move", "control", "link")
+    status: np.ndarray[tuple[int], np.dtype[np.int_]] = labelled(
+        *STATUS_LABEL[:2], "control", flags=STATUS_LABEL[2]
+    )
+    control: tuple[str, ...] = labelled(
+        "1", "of the links, in the fast move", "control", default=("on", "off")
+    )
 
-    @property
+    @derived("", "[s]; null: from the initial state, without a move")
     def move_time(self) -> float | None:
-        """[s]; None: from the initial state, without a move."""
         motion = self.study.motion
         assert isinstance(motion.move_time, float)
         return motion.move_time if len(motion.waypoints) > 1 else None
+
+    @derived("", "how the runs ended, in words")
+    def ended(self) -> list[str]:
+        return [describe(int(code)) for code in self.status]
 
     @property
     def worst(self) -> np.ndarray:
@@ -56,5 +65,5 @@ def run_fast_move(study: Study) -> ControlEffect:
 
 
 @kept_jit(static_argnums=0)
-def _simulate(structure: Structure, cases: Case) -> Result:
+def _simulate(structure: Structure, cases: Case) -> RunResult:
     return jax.vmap(lambda case: simulate(structure, case))(cases)

@@ -29,7 +29,7 @@ def _plain_ticks(axis: Axis) -> None:
 
 def _has_departures(certificate: Certificate) -> bool:
     """Whether plants of the same basis and size differ."""
-    return certificate.plants.shape[1] > 1
+    return certificate.variants.shape[1] > 1
 
 
 def margins(certificate: Certificate, ax: Axes | None = None) -> Axes:
@@ -40,20 +40,19 @@ def margins(certificate: Certificate, ax: Axes | None = None) -> Axes:
         ax: where to draw; default: a new figure.
     """
     ax = figures.axes_or_new(ax)
-    sizes = [plant.n_modes for plant in certificate.plants[0, 0]]
+    sizes = certificate.plant_modes
     shown = np.flatnonzero(certificate.exists.any(axis=(0, 2)))[::-1]  # the first one on top
-    values = np.maximum(certificate.margin, LEAST)
+    values = np.maximum(certificate.gain_margin, LEAST)
     for b, color, marker in zip(range(len(values)), figures.SERIES, "osD", strict=False):
         if not certificate.exists[b].any():
             continue
         at = np.arange(len(shown)) + 0.2 * (b - (len(values) - 1) / 2)
         style: dict[str, Any] = {"color": color, "marker": marker, "linestyle": "none"}
-        ax.plot(
-            values[b, shown, -1], at, markersize=4, label=certificate.plants[b, 0, 0].basis, **style
-        )
+        basis = str(certificate.basis[b])
+        ax.plot(values[b, shown, -1], at, markersize=4, label=basis, **style)
         if len(sizes) > 1:
             ax.plot(values[b, shown, 0], at, markersize=7, markerfacecolor="none", **style)
-    for place, text in ((certificate.required, "required"), (1.0, "unstable")):
+    for place, text in ((certificate.required_margin, "required"), (1.0, "unstable")):
         ax.axvline(place, color="black", linewidth=0.9, linestyle="--" if place > 1 else "-")
         ax.annotate(
             text,
@@ -64,7 +63,7 @@ def margins(certificate: Certificate, ax: Axes | None = None) -> Axes:
             ha="center",
             fontsize=figures.SMALL,
         )
-    ax.set_yticks(np.arange(len(shown)), [str(certificate.plants[0, d, 0].mismatch) for d in shown])
+    ax.set_yticks(np.arange(len(shown)), certificate.mismatch[shown])
     ax.set(xlabel="gain margin [1]", xscale="log", ylim=(-0.6, len(shown) - 0.4))
     ax.tick_params(axis="y", labelsize=figures.SMALL)
     _plain_ticks(ax.xaxis)
@@ -81,7 +80,7 @@ def mode_damping(certificate: Certificate, ax: Axes | None = None) -> Axes:
         ax: where to draw; default: a new figure.
     """
     ax = figures.axes_or_new(ax)
-    frequency, zeta = certificate.frequency_hz[:, :, -1], certificate.damping_ratio[:, :, -1]
+    frequency, zeta = certificate.frequency[:, :, -1], certificate.damping_ratio[:, :, -1]
     for b, color, marker in zip(range(len(frequency)), figures.SERIES, "osD^v", strict=False):
         if np.all(np.isnan(zeta[b])):
             continue
@@ -93,11 +92,11 @@ def mode_damping(certificate: Certificate, ax: Axes | None = None) -> Axes:
             markersize=3,
             alpha=0.6,
             markeredgewidth=0,
-            label=certificate.plants[b, 0, 0].basis,
+            label=certificate.basis[b],
         )
     ax.plot(
         frequency.ravel(),
-        certificate.free_damping[:, :, -1].ravel(),
+        certificate.free_damping_ratio[:, :, -1].ravel(),
         "_",
         color="black",
         markersize=4,
@@ -117,7 +116,7 @@ def mode_damping(certificate: Certificate, ax: Axes | None = None) -> Axes:
     ax.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     ax.yaxis.set_minor_locator(NullLocator())
     _plain_ticks(ax.xaxis)
-    size = certificate.plants[0, 0, -1].n_modes
+    size = int(certificate.plant_modes[-1])
     which = ", all mismatches" if _has_departures(certificate) else ""
     ax.set(
         xlabel=f"frequency [Hz], plants of {size} modes a link{which}",
@@ -165,7 +164,7 @@ def leakage(certificate: Certificate) -> Figure:
     with figures.styled():
         figure, axes = figures.new_figure(len(bases), 1, 0.55 + 0.28 * size.shape[3])
         for b, ax in zip(bases, axes[:, 0], strict=True):
-            name = certificate.plants[b, 0, 0].basis
+            name = certificate.basis[b]
             leakage_map(np.nanmax(size[b], axis=(0, 1)), certificate.n_controlled, name, ax)
         for ax in axes[:-1, 0]:
             ax.set_xlabel("")

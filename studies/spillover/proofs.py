@@ -6,7 +6,6 @@ Bounds and cells are those of `jaxmodel.zero_exclusion`; this module brings a de
 from __future__ import annotations
 
 import time
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +22,7 @@ from studies.engine.controller import FixedController
 from studies.engine.eigenvalues import eigenvalues
 from studies.engine.programs import kept_jit
 from studies.engine.stability import gain_margin
+from studies.results.labelled import Labelled, derived, told, unwritten
 from studies.spillover.plants import (
     LARGEST,
     LoopBuilder,
@@ -49,39 +49,43 @@ SLICES, SHARE_CELLS, BOX_CELLS = 256, 30_000, 1_000_000
 SMALLEST = np.array([2e-6, 1e-5, 1e-3, 1e-3, 1e-3])
 
 
-class AllModes(NamedTuple):
+class AllModes(Labelled):
     """Gain margins that hold for every number of modes from `n_base` on."""
 
-    margin: float  # proven: common gain factor, all smaller ones stable [1]
-    base_margin: float  # of the plant with `n_base` modes, by eigenvalues [1]
-    n_base: int  # modes per link
-    fault: str = ""  # why there is none
+    margin: float = told("proven: common gain factor, all smaller ones stable [1]")
+    base_margin: float = told("of the plant with `n_base` modes, by eigenvalues [1]")
+    n_base: int = told("modes per link")
+    fault: str = told("why there is no proof, empty otherwise", default="")
 
 
-class ProvenBox(NamedTuple):
+class ProvenBox(Labelled):
     """What is known of all machines of a box, see `BOX`."""
 
-    ranges: tuple[tuple[float, float], ...]
-    undecided: float  # share of the box's volume [1]
-    has_all_modes: bool  # holds for every number of modes from `n_base` on
-    n_base: int
-    cells: int  # of frequency and box that were evaluated
-    seconds: float
-    # a machine of the box that is unstable, by eigenvalues: (stiffness, delay, payload), or None
-    unstable: tuple[float, float, float] | None = None
-    fault: str = ""  # why nothing is known
+    ranges: tuple[tuple[float, float], ...] = told("of stiffness [1], delay [samples], load [kg]")
+    undecided: float = told("share of the box's volume [1]")
+    has_all_modes: bool = told("holds for every number of modes from `n_base` on")
+    n_base: int = told("modes per link")
+    cells: int = told("of frequency and box that were evaluated")
+    seconds: float = unwritten()
+    unstable: tuple[float, float, float] | None = told(
+        "an unstable machine, by eigenvalues; null: none found", default=None
+    )
+    fault: str = told("why nothing is known", default="")
 
-    @property
+    @derived("", "whether no machine of the box is unstable")
     def is_proven(self) -> bool:
-        """Whether no machine of the box is unstable."""
         return not self.fault and self.undecided == 0
 
 
-class Proofs(NamedTuple):
-    """Of one design."""
+class Proofs(Labelled):
+    """What holds for more than single plants."""
 
-    all_modes: AllModes
-    box: ProvenBox
+    all_modes: AllModes = told("for every number of modes")
+    box: ProvenBox = told("for a box of machines")
+
+    @derived("", "the same in a sentence each")
+    def statements(self) -> tuple[str, str]:
+        return proof_texts(self)
 
 
 def proof_texts(proofs: Proofs) -> tuple[str, str]:
@@ -221,24 +225,24 @@ def prove_box(design: FixedController, law: Controller, seconds: float) -> Prove
         ranges=BOX, undecided=1.0, has_all_modes=has_tail, n_base=LARGEST, cells=0, seconds=0.0
     )
     if fault := _not_covered(design):
-        return nothing._replace(fault=fault)
+        return nothing.replace(fault=fault)
     if not BASES[basis].is_on_chord:
-        return nothing._replace(fault=f"{basis}: its modes move the far ends of the links")
+        return nothing.replace(fault=f"{basis}: its modes move the far ends of the links")
     if design.structure.has_wrench and not has_tail:
-        return nothing._replace(fault=f"{basis} under a steady load: its modes change")
+        return nothing.replace(fault=f"{basis} under a steady load: its modes change")
     if design.structure.has_wrench and design.structure.has_stretch:
-        return nothing._replace(fault="links under a steady load: softer ones are longer at rest")
+        return nothing.replace(fault="links under a steady load: softer ones are longer at rest")
     radius = SpectralRadius(design, law, basis)
     corners = [(e, d, m) for e in BOX[0] for d in BOX[1] for m in BOX[2]]
     e, d, m = (sum(ends) / 2 for ends in BOX)
     for machine in ((e, d, m), *corners):
         if radius(*machine) > 1 + RADIUS_TOLERANCE:
-            return nothing._replace(unstable=machine)
+            return nothing.replace(unstable=machine)
     try:
         loop = collect(design, law, basis, KNOWN if has_tail else LARGEST)
         setup = prepare_exclusion(loop, LARGEST, BOX[0], _payload(design, BOX[2][1]), has_tail)
     except ValueError as error:
-        return nothing._replace(fault=str(error))
+        return nothing.replace(fault=str(error))
     ranges = np.array([*BOX[:2], _payload(design, BOX[2][1]), (1.0, 1.0)])
     cells = start_cells(setup, ranges, SLICES)
     smallest = SMALLEST * [cells.high[-1, 0], 1, 1, 1, 1]
@@ -246,12 +250,12 @@ def prove_box(design: FixedController, law: Controller, seconds: float) -> Prove
     found = exclude_zeros(
         setup, cells, smallest, BOX_CELLS, lambda: time.monotonic() - start > seconds
     )
-    box = nothing._replace(
+    box = nothing.replace(
         undecided=volume(found.undecided, ranges[:3]),
         cells=found.evaluated,
         seconds=time.monotonic() - start,
     )
-    return box._replace(unstable=_counterexample(found.undecided, radius, ranges))
+    return box.replace(unstable=_counterexample(found.undecided, radius, ranges))
 
 
 def _counterexample(

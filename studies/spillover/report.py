@@ -10,17 +10,14 @@ from markupsafe import Markup
 
 from jaxmodel import status
 from jaxmodel.laws import LAWS
-from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 from studies.engine.breaking import UNITS
 from studies.engine.fast_motion import FAST, WINDOW
-from studies.show.document import json_text
 from studies.show.pages import page
 from studies.show.sketch import CAPTION
 from studies.show.words import motion_text
-from studies.spillover.certificate import Certificate, Spillover
+from studies.spillover.certificate import Certificate
 from studies.spillover.fast_move import ControlEffect
-from studies.spillover.plants import PlantVariant
-from studies.spillover.proofs import Proofs, machine_text, proof_texts
+from studies.spillover.proofs import machine_text
 from studies.study.labels import describe
 from studies.study.margin import margin_text
 from studies.study.window import residual_delay
@@ -29,21 +26,11 @@ from studies.study.window import residual_delay
 TINY = 1e-9
 
 
-def verdict(certificate: Certificate) -> str:
-    """One line: passed or failed, and the deciding plant or machine."""
-    at, machine = certificate.worst, certificate.unstable_machine
-    breaking = certificate.breaking[at]
-    margin = (
-        f"gain margin {margin_text(certificate.margin[at], 3)}, {certificate.required:g} required"
-    )
-    if certificate.is_passed:
-        first = f"; first to go unstable beyond it: {breaking}" if breaking else ""
-        return f"passed: {margin}{first}"
-    unstable = "" if machine is None else f"unstable machine in the box: {machine_text(machine)}"
-    if certificate.fails_from == 0:
-        return f"failed by an {unstable}; on the plants: {margin}"
-    state = "" if certificate.radius[at] <= 1 + RADIUS_TOLERANCE else "unstable, "
-    return f"failed by {breaking}: {state}{margin}{unstable and f'; {unstable}'}"
+def statements(certificate: Certificate) -> list[str]:
+    """The verdict, what becomes of modes, and what is proven, in sentences."""
+    texts = certificate.verdict, damping_text(certificate), spillover_text(certificate)
+    proven = () if certificate.proofs is None else certificate.proofs.statements
+    return [text for text in (*texts, *proven) if text]
 
 
 def spillover_text(certificate: Certificate) -> str:
@@ -54,7 +41,7 @@ def spillover_text(certificate: Certificate) -> str:
     return (
         f"control spillover: mode {worst.mode}, which is not controlled, has a damping ratio of "
         f"{worst.damping_ratio:.2g} instead of {worst.free_damping:.2g} without control "
-        f"({worst.plant.basis}, {worst.plant.mismatch})"
+        f"({worst.basis}, {worst.mismatch})"
     )
 
 
@@ -65,7 +52,7 @@ def damping_text(certificate: Certificate) -> str:
         return ""
     most = np.max(np.where(np.isnan(first), -np.inf, first), axis=-1)
     most = np.where(np.isfinite(most), most, np.nan)
-    plant = certificate.plants[np.unravel_index(np.nanargmin(most), most.shape)]
+    plant = certificate.variants[np.unravel_index(np.nanargmin(most), most.shape)]
     return (
         f"damping ratio of mode 1, on the most damped link: {np.nanmin(most):.2g} to "
         f"{np.nanmax(most):.2g} on these plants (least: {plant.basis}, {plant.mismatch})"
@@ -108,7 +95,7 @@ def report(certificate: Certificate, images: Path | None = None) -> str:
         certificate: from `certify`.
         images: folder with the figures; None: a page without.
     """
-    study, margin = certificate.study, float(certificate.margin[certificate.worst])
+    study, margin = certificate.study, float(certificate.gain_margin[certificate.worst])
     return page(
         "spillover/report.html",
         images,
@@ -116,25 +103,25 @@ def report(certificate: Certificate, images: Path | None = None) -> str:
         certificate=certificate,
         study=study,
         law=LAWS[study.control.law],
-        breaking=certificate.breaking[certificate.worst],
+        breaking=certificate.broken_by[certificate.worst],
         residual=residual_text(certificate),
         spillover=spillover_text(certificate),
         change=certificate.smallest_change,
         units=UNITS._asdict(),
         change_rows=_changes(certificate),
         damping=damping_text(certificate),
-        proofs=proof_texts(certificate.proofs) if certificate.proofs is not None else (),
+        proofs=() if certificate.proofs is None else certificate.proofs.statements,
         machine=machine_text(certificate.unstable_machine) if certificate.unstable_machine else "",
         margin=margin,
-        worst=certificate.plants[certificate.worst],
-        share=margin / certificate.required,
+        worst=certificate.variants[certificate.worst],
+        share=margin / certificate.required_margin,
         total=int(certificate.exists.sum()),
         n_left_out=int((~certificate.exists).sum()),
         motion=motion_text(study),
         good=int(certificate.passes[certificate.exists].sum()),
         links="+".join(str(i + 1) for i, is_on in enumerate(study.control.links) if is_on),
-        fewest=certificate.plants[0, 0, 0].n_modes,
-        sizes=[plant.n_modes for plant in certificate.plants[0, 0]],
+        fewest=certificate.plant_modes[0],
+        sizes=certificate.plant_modes,
         free_damping=_free_damping(certificate),
         margins=_margins(certificate),
         leakage=_leakage(certificate),
@@ -150,8 +137,8 @@ def report(certificate: Certificate, images: Path | None = None) -> str:
 def _free_damping(certificate: Certificate) -> list[float]:
     """Least and largest damping ratio without control [1], or one if they hardly differ."""
     low, high = (
-        float(np.nanmin(certificate.free_damping)),
-        float(np.nanmax(certificate.free_damping)),
+        float(np.nanmin(certificate.free_damping_ratio)),
+        float(np.nanmax(certificate.free_damping_ratio)),
     )
     return [low] if high - low < 0.1 * high else [low, high]
 
@@ -159,20 +146,22 @@ def _free_damping(certificate: Certificate) -> list[float]:
 def _margins(certificate: Certificate) -> list[list[str]]:
     """Row of each basis and mismatch: the largest plant, and the margin of the smallest."""
     rows = []
-    for b, d in np.ndindex(certificate.plants.shape[:2]):
+    for b, d in np.ndindex(certificate.variants.shape[:2]):
         if not certificate.exists[b, d].any():
             continue
         last = int(np.flatnonzero(certificate.exists[b, d])[-1])
-        plant = certificate.plants[b, d, last]
+        plant = certificate.variants[b, d, last]
         rows.append(
             [
                 plant.basis,
                 str(plant.mismatch),
-                margin_text(certificate.margin[b, d, last], 3),
-                margin_text(certificate.margin[b, d, 0], 3) if certificate.exists[b, d, 0] else "-",
-                certificate.breaking[b, d, last] or "-",
+                margin_text(certificate.gain_margin[b, d, last], 3),
+                margin_text(certificate.gain_margin[b, d, 0], 3)
+                if certificate.exists[b, d, 0]
+                else "-",
+                certificate.broken_by[b, d, last] or "-",
                 f"{certificate.least_damping[b, d, last]:.3g}",
-                certificate.weakest[b, d, last],
+                certificate.least_damped[b, d, last],
                 "yes"
                 if certificate.passes[b, d][certificate.exists[b, d]].all()
                 else Markup("<b>no</b>"),
@@ -201,7 +190,7 @@ def _leakage(certificate: Certificate) -> dict[str, Any] | None:
         "modes": [f"mode {r + 1}" for r in range(first, last)],
         "rows": [
             [
-                certificate.plants[b, 0, 0].basis,
+                certificate.basis[b],
                 f"q^{j + 1}",
                 *(f"{x:.2g}" if x > TINY else "0" for x in size[b, j]),
             ]
@@ -218,7 +207,7 @@ def _largest(certificate: Certificate, leakage: np.ndarray) -> dict[str, Any]:
     """
     size = np.nan_to_num(np.abs(leakage))
     b, d, _, j, r = np.unravel_index(np.argmax(size), size.shape)
-    mode, plant = int(r) + certificate.n_controlled + 1, certificate.plants[b, d, 0]
+    mode, plant = int(r) + certificate.n_controlled + 1, certificate.variants[b, d, 0]
     return {"size": size.max(), "mode": mode, "controlled": int(j) + 1, "plant": plant}
 
 
@@ -228,99 +217,3 @@ def _fast_rows(move: ControlEffect) -> list[list[str]]:
         [how, " / ".join(f"{1e6 * x:.3g}" for x in rms), describe(int(code))]
         for how, rms, code in zip(("on", "off"), move.residual_rms, move.status, strict=True)
     ]
-
-
-def document(certificate: Certificate) -> str:
-    """JSON text: the verdict and every number, null if there is none."""
-    whole: dict[str, Any] = {
-        "title": certificate.study.title,
-        "is_passed": certificate.is_passed,
-        "spillover": certificate.spillover and _spillover_entry(certificate.spillover),
-        "verdict": verdict(certificate),
-        "required_margin": certificate.required,
-        "smallest_margin": float(np.nanmin(certificate.margin)),
-        "fails_from_modes": certificate.fails_from or None,
-        "notes": list(certificate.notes),
-        "plants": [_plant(certificate, tuple(at)) for at in np.argwhere(certificate.exists)],
-        "proofs": certificate.proofs and _proofs(certificate.proofs),
-        "smallest_change": certificate.smallest_change and certificate.smallest_change.record(),
-        "fast_move": certificate.fast_move and _fast_move(certificate.fast_move),
-        "study": certificate.study.model_dump(mode="json"),
-    }
-    return json_text("spillover", whole, version=3)
-
-
-def _proofs(proofs: Proofs) -> dict[str, Any]:
-    modes, box = proofs
-    unstable = None
-    if box.unstable is not None:
-        names = ("stiffness_factor", "extra_delay_samples", "more_payload_kg")
-        unstable = dict(zip(names, box.unstable, strict=True))
-    return {
-        "statements": list(proof_texts(proofs)),
-        "all_modes": {
-            "gain_margin": modes.margin,
-            "base_gain_margin": modes.base_margin,
-            "from_modes": modes.n_base,
-            "fault": modes.fault,
-        },
-        "box": {
-            "is_proven": box.is_proven,
-            "stiffness_factor": list(box.ranges[0]),
-            "extra_delay_samples": list(box.ranges[1]),
-            "more_payload_kg": list(box.ranges[2]),
-            "undecided_share": box.undecided,
-            "has_all_modes": box.has_all_modes,
-            "from_modes": box.n_base,
-            "cells": box.cells,
-            "unstable": unstable,
-            "fault": box.fault,
-        },
-    }
-
-
-def _fast_move(move: ControlEffect) -> dict[str, Any]:
-    return {
-        "move_time_s": move.move_time,
-        "residual_rms_m": move.residual_rms[0],
-        "residual_rms_without_control_m": move.residual_rms[1],
-        "run": describe(int(move.status[0])),
-        "run_without_control": describe(int(move.status[1])),
-    }
-
-
-def _spillover_entry(worst: Spillover) -> dict[str, Any]:
-    return {
-        "mode": worst.mode,
-        "damping_ratio": worst.damping_ratio,
-        "damping_ratio_without_control": worst.free_damping,
-        "basis": worst.plant.basis,
-        "modes": worst.plant.n_modes,
-        "mismatch": str(worst.plant.mismatch),
-    }
-
-
-def _plant(certificate: Certificate, at: tuple[int, ...]) -> dict[str, Any]:
-    plant = certificate.plants[at]
-    return {
-        "basis": plant.basis,
-        "modes": plant.n_modes,
-        "sensor_length_factor": plant.mismatch.sensor,
-        "actuator_length_factor": plant.mismatch.actuator,
-        "frequency_factor": plant.mismatch.frequency,
-        "joint_inertia_c_kg_m2": _joint(certificate, plant),
-        "passes": bool(certificate.passes[at]),
-        "spectral_radius": certificate.radius[at],
-        "gain_margin": certificate.margin[at],
-        "broken_by": str(certificate.breaking[at]),
-        "least_damped": str(certificate.weakest[at]),
-        "frequency_hz": certificate.frequency_hz[at][: plant.n_modes],
-        "damping_ratio": certificate.damping_ratio[at][: plant.n_modes],
-        "damping_ratio_without_control": certificate.free_damping[at][: plant.n_modes],
-    }
-
-
-def _joint(certificate: Certificate, plant: PlantVariant) -> Any:
-    """True J_C [kg m2], one for all links or three."""
-    joint_inertia = plant.mismatch.joint_inertia
-    return certificate.study.link.joint_inertia_c if joint_inertia is None else joint_inertia

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.console import Console
@@ -23,22 +22,16 @@ from studies.engine.runs import resolved_study
 from studies.errors import StudyError
 from studies.publish import REPORT, announce, check_folder, publish
 from studies.reading import read_json
+from studies.results.document import json_text
+from studies.results.labelled import variables
 from studies.show import figures
 from studies.show.sketch import sketch
 from studies.spillover import plots
 from studies.spillover.certificate import Certificate, certify
 from studies.spillover.fast_move import run_fast_move
-from studies.spillover.proofs import proof_texts, prove
-from studies.spillover.report import (
-    damping_text,
-    document,
-    report,
-    residual_text,
-    spillover_text,
-    verdict,
-)
-from studies.store import Variable, write_store
-from studies.study.labels import STATUS_LABEL
+from studies.spillover.proofs import prove
+from studies.spillover.report import report, residual_text, statements
+from studies.store import write_store
 from studies.study.margin import GUESSED
 from studies.study.spec import Study
 
@@ -87,12 +80,12 @@ def spillover_design(
         certificate = certify(study, margin, bases=bases)
         if has_proofs:
             phases.begin("prove", "every number of modes, and a box of machines")
-            certificate = certificate._replace(proofs=prove(fixed_controller(study)))
-        for text in _statements(certificate):
+            certificate = certificate.replace(proofs=prove(fixed_controller(study)))
+        for text in statements(certificate):
             console.print(text, soft_wrap=True)
         phases.begin("smallest change", "of the machine that breaks the design")
         change = smallest_change(fixed_controller(certificate.study), tolerances)
-        certificate = certificate._replace(smallest_change=change)
+        certificate = certificate.replace(smallest_change=change)
         console.print(change.text, soft_wrap=True)
         phases.begin("fast move", "of the nominal machine, with and without control")
         certificate = _with_fast_move(certificate)
@@ -101,7 +94,7 @@ def spillover_design(
         phases.begin("draw")
         with publish(out) as staging:
             write_store(staging / DATA, variables(certificate), run_attributes(study))
-            (staging / DOCUMENT).write_text(document(certificate), encoding="utf-8")
+            (staging / DOCUMENT).write_text(json_text(certificate), encoding="utf-8")
             _draw(staging, certificate, has_pdf)
             (staging / REPORT).write_text(report(certificate, staging), encoding="utf-8")
     for note in (*certificate.notes, GUESSED):
@@ -126,19 +119,12 @@ def _check_owner(out: Path, study: Study) -> None:
         )
 
 
-def _statements(certificate: Certificate) -> list[str]:
-    """Lines to print: the verdict, what becomes of modes, what is proven."""
-    texts = verdict(certificate), damping_text(certificate), spillover_text(certificate)
-    proven = () if certificate.proofs is None else proof_texts(certificate.proofs)
-    return [text for text in (*texts, *proven) if text]
-
-
 def _with_fast_move(certificate: Certificate) -> Certificate:
     """The same with its fast move, or with a note why it cannot run."""
     try:
-        return certificate._replace(fast_move=run_fast_move(certificate.study))
+        return certificate.replace(fast_move=run_fast_move(certificate.study))
     except StudyError as error:
-        return certificate._replace(notes=(*certificate.notes, f"no fast move: {error}"))
+        return certificate.replace(notes=(*certificate.notes, f"no fast move: {error}"))
 
 
 def _draw(folder: Path, certificate: Certificate, has_pdf: bool) -> None:
@@ -155,84 +141,3 @@ def _draw(folder: Path, certificate: Certificate, has_pdf: bool) -> None:
         drawings["leakage"] = partial(plots.leakage, certificate)
     figures.draw(folder, drawings, has_pdf)
     figures.draw(folder, {"machine": partial(sketch, certificate.study)})
-
-
-def variables(certificate: Certificate) -> dict[str, Variable]:
-    """Labelled numbers of a certificate."""
-    plants = ("basis", "mismatch", "plant_modes")
-    modes = (*plants, "link_mode", "pole")
-    place, axes = plants[:2], certificate.plants
-    true = [plant.mismatch for plant in axes[0, :, 0]]
-    part = {
-        "basis": Variable(
-            np.array([p.basis for p in axes[:, 0, 0]]), ("basis",), "1", "of the plant"
-        ),
-        "mismatch": Variable(
-            np.array([str(d) for d in true]),
-            ("mismatch",),
-            "1",
-            "mismatch from the nominal model",
-        ),
-        "sensor_factor": Variable(
-            np.array([d.sensor for d in true]), ("mismatch",), "1", "true over nominal length"
-        ),
-        "actuator_factor": Variable(
-            np.array([d.actuator for d in true]), ("mismatch",), "1", "true over nominal length"
-        ),
-        "frequency_factor": Variable(
-            np.array([d.frequency for d in true]),
-            ("mismatch",),
-            "1",
-            "true over nominal frequencies of the links",
-        ),
-        "plant_modes": Variable(
-            np.array([p.n_modes for p in axes[0, 0]]), ("plant_modes",), "1", "per link"
-        ),
-        "passes": Variable(certificate.passes, plants, "1", "stable with the margin required"),
-        "spectral_radius": Variable(
-            certificate.radius, plants, "1", "of the loop at its own gains"
-        ),
-        "gain_margin": Variable(
-            certificate.margin, plants, "1", "common gain factor before instability"
-        ),
-        "frequency": Variable(
-            certificate.frequency_hz,
-            modes,
-            "Hz",
-            "of link modes under control, three of each order",
-        ),
-        "damping_ratio": Variable(certificate.damping_ratio, modes, "1", "their damping ratios"),
-        "free_damping_ratio": Variable(certificate.free_damping, modes, "1", "without control"),
-        "least_damped": Variable(certificate.weakest, plants, "1", "mode of least damping"),
-        "broken_by": Variable(
-            certificate.breaking, plants, "1", "what goes unstable beyond the margin"
-        ),
-        "observation": Variable(
-            certificate.observation,
-            (*place, "link", "channel", "link_mode"),
-            "1",
-            "channel signal per modal coordinate of the plant (SRF: V/m)",
-        ),
-        "actuation": Variable(
-            certificate.actuation,
-            (*place, "link", "link_mode", "channel"),
-            "1",
-            "modal force on the plant per force of a channel (SRF: N/V)",
-        ),
-        "required_margin": Variable(
-            np.array(certificate.required), (), "1", "gain margin required"
-        ),
-    }
-    move = certificate.fast_move
-    if move is None:
-        return part
-    control = ("control",)
-    return part | {
-        "control": Variable(
-            np.array(["on", "off"]), control, "1", "of the links, in the fast move"
-        ),
-        "residual_rms": Variable(
-            move.residual_rms, ("control", "link"), "m", "worst station after the fast move"
-        ),
-        "status": Variable(move.status, control, *STATUS_LABEL),
-    }

@@ -6,6 +6,8 @@ from jaxmodel import status
 
 #: Where a station is.
 STATION_TEXT = "position along the link, over its length"
+#: Of the platform's coordinates.
+POSE_UNITS = "m; m; rad"
 #: What `singularity_distance` means.
 DISTANCE_TEXT = "of link angles from 0 and 90 deg, and of the links from lines through one point"
 

@@ -21,7 +21,7 @@ from studies.cluster.connect import (
 from studies.config import start
 from studies.errors import StudyError
 from studies.publish import EXPLORER, REPORT, announce
-from studies.show.document import AsJson, print_document
+from studies.results.document import AsJson, print_document
 
 if TYPE_CHECKING:
     from studies.engine.results import SweepData
@@ -101,7 +101,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if dry_run:
             plan = make_plan(sweep_spec, out if resume else None)
             if as_json:
-                print_document("sweep", plan_document(plan))
+                print_document(plan_document(plan))
             else:
                 print_plan(plan, console)
             return
@@ -171,7 +171,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if as_json:
             from studies.sweeps.documents import show_document
 
-            print_document("show", show_document(data, failed))
+            print_document(show_document(data, failed))
             return
         show_sweep(data, console, failed)
         print_causes(data, console)
@@ -203,8 +203,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             ranked_cases,
         )
 
-        data, name = _read(folder), by.removeprefix("-")
-        agreed = ""
+        data, name, agreed = _read(folder), by.removeprefix("-"), ""
         if data.spec.sweep.fidelity == "linear":
             start()
             from studies.engine.fidelity import agreement
@@ -212,20 +211,17 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             if found := agreement(data.spec, data.table, by):
                 found.check('Rank by another metric, or run the sweep with fidelity = "full".')
                 agreed = found.text
+        cases, changes = ranked_cases(data, by, subject_to, count), None
+        if breaks:
+            from studies.sweeps.breaking import breaking_changes
+
+            changes = breaking_changes(folder, cases.tolist(), tolerance or [])
         if as_json:
             from studies.sweeps.documents import best_document
 
             document = best_document(data, by, subject_to, count)
-            if breaks:
-                from studies.sweeps.breaking import breaking_changes
-
-                numbers = [case["case"] for case in document["cases"]]
-                document["smallest_changes"] = [
-                    entry.record() for entry in breaking_changes(folder, numbers, tolerance or [])
-                ]
-            print_document("best", document)
+            print_document(document.replace(smallest_changes=changes and list(changes)))
             return
-        cases = ranked_cases(data, by, subject_to, count)
         print_uncontrolled(data, name, console)
         if agreed:
             console.print(agreed, soft_wrap=True)
@@ -235,11 +231,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         )
         print_cases(data, cases, [name], console)
         print_left_out(data, console)
-        if breaks:
-            from studies.sweeps.breaking import breaking_changes
-
-            for entry in breaking_changes(folder, cases.tolist(), tolerance or []):
-                console.print(f"case {entry.case}: {entry.text}", soft_wrap=True)
+        for entry in changes or ():
+            console.print(f"case {entry.case}: {entry.text}", soft_wrap=True)
 
     @app.command()
     def plot(
@@ -283,7 +276,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if as_json:
             from studies.sweeps.documents import sensitivity_document
 
-            print_document("sensitivity", sensitivity_document(data, by, analysis))
+            print_document(sensitivity_document(data, by, analysis))
             return
         design = f"a {data.spec.sweep.method} design"
         console.print(f"{label(data, by)}, {len(data.table.origin)} rows of {design}")

@@ -10,11 +10,12 @@ from rich.console import Console
 
 from studies.config import usable_cores
 from studies.engine.chunks import run_quietly
-from studies.engine.plan import local_layout
+from studies.engine.plan import Group, local_layout
 from studies.engine.preflight import check_run
 from studies.engine.progress import duration_text
 from studies.engine.stored import chunk_arrays
 from studies.errors import StudyError
+from studies.results.labelled import Labelled, labelled, told
 from studies.show.listing import Rows, print_rows
 from studies.show.units import count_text
 from studies.space.table import CaseTable, case_study
@@ -28,14 +29,60 @@ from studies.sweeps.show import short_value
 MEASURED = 32
 
 
-def estimate(plan: Plan) -> dict[str, float]:
-    """Time and storage that the cases left take in this process, measured on some of each program.
+class Estimate(Labelled):
+    """Time and storage that cases take."""
 
-    Returns:
-        "seconds" of running and judging; "compile_seconds" spent here, which commands need not
-        spend again; "bytes" on disk; "measured_cases".
-    """
-    found = dict.fromkeys(("seconds", "compile_seconds", "bytes", "measured_cases"), 0.0)
+    seconds: float = labelled("s", "of running and judging")
+    compile_seconds: float = labelled("s", "spent here, which commands need not spend again")
+    bytes: float = labelled("byte", "of results on disk")
+    measured_cases: int = told("that were run")
+
+
+class SweptAxis(Labelled):
+    """What varies in a sweep."""
+
+    name: str = told("of the column")
+    unit: str = told("SI symbol, 1 for none")
+    n_values: int = told("how many values")
+    smallest: float | None = told("of them, in that unit; null for what is no number")
+    largest: float | None = told("the same")
+
+
+class PlannedProgram(Labelled):
+    """A program of a sweep, and the cases that it runs."""
+
+    law: str = told("of control")
+    basis: str = told("of the links' modes")
+    feedback: str = told("sampled, ideal or none")
+    is_linear: bool = told("of a screen")
+    n_modes: int = told("per link")
+    n_samples: int = told("of a run")
+    substeps: int = told("plant steps per sample")
+    n_cases: int = told("that it runs")
+    n_chunks: int = told("of these")
+    devices: int = told("side by side")
+    blocks: int = told("of cases on each")
+    lanes: int = told("cases of a block")
+
+
+class PlanDocument(Labelled, command="sweep"):
+    """What `studies sweep --dry-run --json` prints: the plan of a sweep."""
+
+    title: str = told("of the study")
+    n_cases: int = told("cases")
+    n_left_out: int = told("by where")
+    n_duplicates: int = told("left out")
+    n_computed: int = told("cases that --resume finds in the folder")
+    axes: list[SweptAxis] = told("what varies")
+    programs: list[PlannedProgram] = told("what would be compiled and run")
+    sample: dict[str, Any] = told("the case in the middle: number, id, what varies")
+    sample_fault: str = told("why the sample cannot run, empty if it can")
+    estimate: Estimate = told("of the cases left, in one process on this machine")
+
+
+def estimate(plan: Plan) -> Estimate:
+    """What the cases left take in this process, measured on some of each program."""
+    seconds, compiling, size, measured = 0.0, 0.0, 0.0, 0
     for group in plan.groups:
         count = min(MEASURED, len(group.rows))
         chosen = np.linspace(0, len(group.rows) - 1, count).astype(int)
@@ -50,24 +97,24 @@ def estimate(plan: Plan) -> dict[str, float]:
             chunks = list(run_quietly(plan.table, [some]))
             spent.append(time.perf_counter() - began)
         share = len(group.rows) / count
-        found["seconds"] += share * spent[1]
-        found["compile_seconds"] += max(spent[0] - spent[1], 0.0)
+        seconds += share * spent[1]
+        compiling += max(spent[0] - spent[1], 0.0)
         for done in chunks:
             arrays = chunk_arrays(plan.table, done, list(done.judged.result.metrics))
-            found["bytes"] += share * sum(x.nbytes for x in arrays.values())
-        found["measured_cases"] += count
-    return found
+            size += share * sum(x.nbytes for x in arrays.values())
+        measured += count
+    return Estimate(seconds, compiling, size, measured)
 
 
-def estimate_text(plan: Plan, found: dict[str, float]) -> str:
+def estimate_text(plan: Plan, found: Estimate) -> str:
     """The same as a sentence."""
     left = sum(len(group.rows) for group in plan.groups)
     return (
-        f"time: about {duration_text(found['seconds'])} for {count_text(left, 'case')} in this "
-        f"process on {count_text(usable_cores(), 'core')}, by {found['measured_cases']:.0f} that "
-        f"were run, and what compiling takes, {duration_text(found['compile_seconds'])} just now; "
+        f"time: about {duration_text(found.seconds)} for {count_text(left, 'case')} in this "
+        f"process on {count_text(usable_cores(), 'core')}, by {found.measured_cases} that "
+        f"were run, and what compiling takes, {duration_text(found.compile_seconds)} just now; "
         f"N machines like this one (--scheduler) take 1/N. Storage: "
-        f"about {found['bytes'] / 2**20:.2g} MiB"
+        f"about {found.bytes / 2**20:.2g} MiB"
     )
 
 
@@ -106,36 +153,37 @@ def print_plan(plan: Plan, console: Console) -> None:
     console.print(estimate_text(plan, estimate(plan)), soft_wrap=True)
 
 
-def plan_document(plan: Plan) -> dict[str, Any]:
+def plan_document(plan: Plan) -> PlanDocument:
     """What `studies sweep --dry-run` says."""
     table = plan.table
-    programs = [
-        {
-            "law": group.structure.law,
-            "basis": group.structure.basis,
-            "feedback": group.structure.feedback,
-            "is_linear": group.structure.is_linear,
-            "n_modes": group.structure.n_modes,
-            "n_samples": group.structure.n_steps,
-            "substeps": group.structure.substeps,
-            "n_cases": len(group.rows),
-            "n_chunks": len(group.chunks()),
-            **group.layout._asdict(),
-        }
-        for group in plan.groups
-    ]
-    return {
-        "title": table.study.title,
-        "n_cases": len(table),
-        "n_left_out": table.n_dropped,
-        "n_duplicates": table.n_double,
-        "n_computed": plan.n_before,
-        "axes": axis_records(table),
-        "programs": programs,
-        "sample": sample_record(table),
-        "sample_fault": sample_fault(table),
-        "estimate": estimate(plan),
-    }
+    return PlanDocument(
+        title=table.study.title,
+        n_cases=len(table),
+        n_left_out=table.n_dropped,
+        n_duplicates=table.n_double,
+        n_computed=plan.n_before,
+        axes=axes_of(table),
+        programs=[_program(group) for group in plan.groups],
+        sample=sample_record(table),
+        sample_fault=sample_fault(table),
+        estimate=estimate(plan),
+    )
+
+
+def _program(group: Group) -> PlannedProgram:
+    structure = group.structure
+    return PlannedProgram(
+        law=structure.law,
+        basis=structure.basis,
+        feedback=structure.feedback,
+        is_linear=structure.is_linear,
+        n_modes=structure.n_modes,
+        n_samples=structure.n_steps,
+        substeps=structure.substeps,
+        n_cases=len(group.rows),
+        n_chunks=len(group.chunks()),
+        **group.layout._asdict(),
+    )
 
 
 def sample_record(table: CaseTable) -> Record:
@@ -154,29 +202,28 @@ def sample_fault(table: CaseTable) -> str:
     return ""
 
 
-def axis_records(table: CaseTable) -> list[Record]:
-    """Number of values of each column of a sweep, and their range, None for what has none."""
-    records = []
+def axes_of(table: CaseTable) -> list[SweptAxis]:
+    """Number of values of each column of a sweep, and their range."""
+    axes = []
     for name in table.axes:
         entry, column = parse_entry(name), table.columns[name]
         is_numeric = column.dtype.kind in "fi"
-        records.append(
-            {
-                "name": name,
-                "unit": field_unit(entry.field if entry else name),
-                "n_values": len({str(value) for value in column.tolist()}),
-                "smallest": column.min() if is_numeric else None,
-                "largest": column.max() if is_numeric else None,
-            }
+        axes.append(
+            SweptAxis(
+                name=name,
+                unit=field_unit(entry.field if entry else name),
+                n_values=len({str(value) for value in column.tolist()}),
+                smallest=column.min() if is_numeric else None,
+                largest=column.max() if is_numeric else None,
+            )
         )
-    return records
+    return axes
 
 
 def axis_rows(table: CaseTable) -> Rows:
     """The same as a table."""
     rows = [
-        [x["name"], x["unit"], str(x["n_values"]), *(_end(x[y]) for y in ("smallest", "largest"))]
-        for x in axis_records(table)
+        [x.name, x.unit, str(x.n_values), _end(x.smallest), _end(x.largest)] for x in axes_of(table)
     ]
     return Rows(["axis", "unit", "values", "smallest", "largest"], rows)
 

@@ -1,6 +1,6 @@
 """What reading commands say of a sweep, as numbers in SI units under their names in its file.
 
-Tables (`studies.sweeps.show`) and JSON documents (`studies.show.document`) are made of these.
+Tables (`studies.sweeps.show`) and JSON documents (`studies.sweeps.documents`) are made of these.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from jaxmodel import status
 from studies.engine.columns import NOT_RUN, ON_DEMAND, PER_CASE
 from studies.engine.results import SweepData, metric_values, swept_names
+from studies.results.labelled import Labelled, told
 from studies.sweeps.environments import design_values
 
 #: Names and values of one row.
@@ -94,12 +95,18 @@ def _bad_time(data: SweepData, case: int) -> float | None:
     return None if is_whole else float(data["bad_time"][case])
 
 
-def status_records(data: SweepData) -> list[Record]:
+class StatusCount(Labelled):
+    """How many cases have a status."""
+
+    status: int = told("code, as in results.h5")
+    status_text: str = told("the same in words")
+    cases: int = told("how many cases")
+
+
+def status_records(data: SweepData) -> list[StatusCount]:
     """Number of cases by status, most frequent first."""
-    return [
-        {"status": code, "status_text": reason(code), "cases": n}
-        for code, n in Counter(data["status"].tolist()).most_common()
-    ]
+    counts = Counter(data["status"].tolist()).most_common()
+    return [StatusCount(code, reason(code), n) for code, n in counts]
 
 
 def units(data: SweepData, names: Iterable[str]) -> dict[str, str]:

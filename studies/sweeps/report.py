@@ -41,6 +41,7 @@ from studies.sweeps.show import (
     case_rows,
     cause_rows,
     counted_text,
+    is_ranked,
     margin_warning,
     mark_note,
     ranked_cases,
@@ -169,12 +170,10 @@ def report(
 
 def _best(data: SweepData, metric: str) -> dict[str, Any] | None:
     """The best cases; None if no case of status ok has the metric."""
-    if metric.partition("[")[0] not in data.variables:
+    if not is_ranked(data, metric):
         return None
     value, margin = metric_values(data, metric), _margins(data)
     is_known = (data["status"] == status.OK) & np.isfinite(value)
-    if not is_known.any():
-        return None
     condition = requirement(data, metric)
     best = ranked_cases(data, metric, condition)
     loose = requirement(data, metric, is_safe=False)

@@ -3,26 +3,33 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from jaxmodel import status
 from studies.engine.results import SweepData, as_sweep, metric_values, swept_names
 from studies.errors import StudyError
+from studies.results.labelled import Labelled, labelled, told
 from studies.space.axes import build_axis
 from studies.space.designs import unit_points
 from studies.space.methods import METHODS, Analysis
 
 
-class Cause(NamedTuple):
+class FailureShare(Labelled):
+    """A part of a parameter's values."""
+
+    share: float = labelled("1", "of failures there")
+    where: str = told("which values")
+
+
+class Cause(Labelled):
     """How failures depend on one parameter."""
 
-    name: str
-    distance: float  # between its distributions in failed and in ok cases (Kolmogorov-Smirnov)
-    p_value: float
-    low: tuple[float, str]  # share of failures in its lowest quarter, a choice: at best; where
-    high: tuple[float, str]  # in its highest quarter, a choice: at worst; where
+    name: str = told("parameter")
+    distance: float = labelled("1", "Kolmogorov-Smirnov distance of failed and of ok cases")
+    p_value: float = labelled("1", "of that distance")
+    low: FailureShare = told("its lowest quarter; of a choice, the best value")
+    high: FailureShare = told("its highest quarter; of a choice, the worst value")
 
 
 def failure_causes(data: SweepData) -> list[Cause]:
@@ -52,18 +59,10 @@ def failure_causes(data: SweepData) -> list[Cause]:
         ends = np.quantile(value, (0.25, 0.75))
         rates = is_failed[value <= ends[0]].mean(), is_failed[value >= ends[1]].mean()
         low, high = (
-            (float(rate), f"{sign} {end:.4g}")
+            FailureShare(float(rate), f"{sign} {end:.4g}")
             for rate, end, sign in zip(rates, ends, ("<=", ">="), strict=True)
         )
-        causes.append(
-            Cause(
-                name=name,
-                distance=float(test.statistic),
-                p_value=float(test.pvalue),
-                low=low,
-                high=high,
-            )
-        )
+        causes.append(Cause(name, float(test.statistic), float(test.pvalue), low, high))
     return sorted(causes, key=lambda cause: -cause.distance)
 
 
@@ -81,8 +80,8 @@ def _text_cause(name: str, value: np.ndarray, is_failed: np.ndarray) -> Cause:
         name=name,
         distance=float(distance),
         p_value=float(chi2_contingency(np.stack([bad, good])).pvalue),
-        low=(float(rate[best]), str(names[best])),
-        high=(float(rate[worst]), str(names[worst])),
+        low=FailureShare(float(rate[best]), str(names[best])),
+        high=FailureShare(float(rate[worst]), str(names[worst])),
     )
 
 

@@ -178,18 +178,13 @@ def ranked_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10
 
 def show(data: SweepData, console: Console, is_failed: bool) -> None:
     """Print an overview, or the failed cases one by one."""
-    codes = data["status"]
     if is_failed:
         _print_failed(data, console)
         return
     console.print(f"{data.spec.study.title}: {data.n_cases} cases, {', '.join(swept_names(data))}")
     print_rows(status_rows(data), console)
-    if not (codes >= 0).any():
-        return
     by = ranking(data)
-    if by.partition("[")[0] not in data.variables:  # no run has finished
-        return
-    if np.isfinite(metric_values(data, by)[codes == status.OK]).any():
+    if is_ranked(data, by):
         condition = requirement(data, by)
         best = ranked_cases(data, by, condition)
         print_uncontrolled(data, by, console)
@@ -198,10 +193,17 @@ def show(data: SweepData, console: Console, is_failed: bool) -> None:
         print_cases(data, best, [by], console)
 
 
+def is_ranked(data: SweepData, metric: str) -> bool:
+    """Whether some case that is ok has a metric."""
+    if metric.partition("[")[0] not in data.variables:  # no run has finished
+        return False
+    return bool(np.isfinite(metric_values(data, metric)[data["status"] == status.OK]).any())
+
+
 def status_rows(data: SweepData) -> Rows:
     """Number of cases by status."""
     rows = [
-        [x["status_text"], str(x["cases"]), f"{100 * x['cases'] / data.n_cases:.1f}"]
+        [x.status_text, str(x.cases), f"{100 * x.cases / data.n_cases:.1f}"]
         for x in status_records(data)
     ]
     return Rows(["status", "cases", "share [%]"], rows)
@@ -490,6 +492,6 @@ def cause_rows(data: SweepData) -> Rows:
     """Which parameters correlate with the failures; no rows if none or all failed."""
     rows = []
     for cause in failure_causes(data)[:8]:
-        low, high = (f"{100 * rate:.0f} % ({at})" for rate, at in (cause.low, cause.high))
+        low, high = (f"{100 * x.share:.0f} % ({x.where})" for x in (cause.low, cause.high))
         rows.append([cause.name, f"{cause.distance:.2f}", f"{cause.p_value:.1g}", low, high])
     return Rows(["parameter", "distance", "p", "failures, lowest quarter", "highest quarter"], rows)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from jaxmodel.metrics import METRICS
+from studies.results.labelled import Variable, Variables
 from studies.space.table import as_numbers
-from studies.store import Variable
 from studies.study.entries import links_text, parse_entries
 from studies.study.labels import STATUS_LABEL
 from studies.study.paths import field_unit, parse_entry
@@ -29,43 +29,36 @@ def free_unit(key: str) -> str:
 
 def variables(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
     """All starts, the best design of each family on fresh machines, random designs."""
-    return {
-        **_settings(spec),
-        **_starts(spec, findings),
-        **_fresh(spec, findings),
-        **_random(findings),
-        **_references(spec, findings),
-    }
+    made = Variables()
+    _put_settings(made, spec)
+    _put_starts(made, spec, findings)
+    _put_fresh(made, spec, findings)
+    _put_loops(made, spec, findings)
+    _put_references(made, spec, findings)
+    if (search := findings.searched) is not None:
+        made.put("search_objective", search.objective, "1", "objective of random designs", "sample")
+        text = "linear residual vibration of random designs"
+        made.put("search_linear_residual", search.linear, "m", text, "sample")
+    return made
 
 
-def _text(values: list[str], axis: str, text: str) -> Variable:
-    return Variable(np.array(values), (axis,), "1", text)
-
-
-def _settings(spec: TuneSpec) -> dict[str, Variable]:
-    numbers, axis = spec.free.numbers, ("free",)
-    low, high, start = (
-        np.array(x)
-        for x in zip(*((f.span.low, f.span.high, f.start) for f in numbers), strict=True)
-    )
-    settings = {
-        "free": _text([f.name for f in numbers], "free", "free parameter"),
-        "free_unit": _text([free_unit(f.key) for f in numbers], "free", "its unit"),
-        "free_low": Variable(low, axis, "1", "lower bound, in the parameter's unit"),
-        "free_high": Variable(high, axis, "1", "upper bound, in the parameter's unit"),
-        "free_study": Variable(start, axis, "1", "the baseline's value, in the parameter's unit"),
-        "family": _text([family.name for family in spec.families], "family", "family"),
-    }
+def _put_settings(made: Variables, spec: TuneSpec) -> None:
+    numbers, own = spec.free.numbers, "in the parameter's unit"
+    made.put("free", [f.name for f in numbers], "1", "free parameter", "free")
+    made.put("free_unit", [free_unit(f.key) for f in numbers], "1", "its unit", "free")
+    made.put("free_low", [f.span.low for f in numbers], "1", f"lower bound, {own}", "free")
+    made.put("free_high", [f.span.high for f in numbers], "1", f"upper bound, {own}", "free")
+    start = [f.start for f in numbers]
+    made.put("free_study", start, "1", f"the baseline's value, {own}", "free")
+    made.put("family", [x.name for x in spec.families], "1", "family", "family")
     if spec.limit_names:
+        made.put("limit", list(spec.limit_names), "1", "what is limited", "limit")
         limits = [[str(x.limits[name]) for name in spec.limit_names] for x in spec.families]
-        settings["limit"] = _text(list(spec.limit_names), "limit", "what is limited")
-        settings["family_limit"] = Variable(
-            np.array(limits), ("family", "limit"), "1", "limit; baseline: its value"
-        )
-    return settings
+        text = "limit; baseline: its value"
+        made.put("family_limit", limits, "1", text, "family", "limit")
 
 
-def _starts(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
+def _put_starts(made: Variables, spec: TuneSpec, findings: TuneFindings) -> None:
     at = findings.at
     family = [spec.moving[k] for k in at.family]
     values = spec.free.values(at.best_place)
@@ -73,155 +66,104 @@ def _starts(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
     whole = at.history[: int(at.iteration)]
     is_best = np.zeros(len(family), bool)
     is_best[[at.winner(k) for k in range(len(spec.moving))]] = True
-    axis, trial = ("start",), ("iteration", "start")
-    starts = {
-        "start_family": _text([x.name for x in family], "start", "family of the starting point"),
-        "is_best": Variable(is_best, axis, "1", "best of its family"),
-        "value": Variable(
-            values,
-            ("start", "free"),
-            "1",
-            "best value from each starting point, in the parameter's unit",
-        ),
-        "patch_center": Variable(
-            np.array(centers), ("start", "link", "patch"), "m", "centres of the patches then"
-        ),
-        "objective": Variable(
-            at.best_objective, axis, "1", "best objective from each starting point"
-        ),
-        "is_frozen": Variable(at.is_frozen, axis, "1", "stopped, a run did not finish"),
-        "linear_residual": Variable(
-            findings.linear, axis, "m", "linear residual vibration of the best design"
-        ),
-        "trial_objective": Variable(whole[..., 0], trial, "1", "objective of each trial"),
-        "trial_excess": Variable(whole[..., 1], trial, "1", "largest excess of each trial"),
-    }
+    names = [x.name for x in family]
+    made.put("start_family", names, "1", "family of the starting point", "start")
+    made.put("is_best", is_best, "1", "best of its family", "start")
+    text = "best value from each starting point, in the parameter's unit"
+    made.put("value", values, "1", text, "start", "free")
+    text = "centres of the patches then"
+    made.put("patch_center", centers, "m", text, "start", "link", "patch")
+    text = "best objective from each starting point"
+    made.put("objective", at.best_objective, "1", text, "start")
+    made.put("is_frozen", at.is_frozen, "1", "stopped, a run did not finish", "start")
+    text = "linear residual vibration of the best design"
+    made.put("linear_residual", findings.linear, "m", text, "start")
+    trial = "iteration", "start"
+    made.put("trial_objective", whole[..., 0], "1", "objective of each trial", *trial)
+    made.put("trial_excess", whole[..., 1], "1", "largest excess of each trial", *trial)
     if spec.limit_names:
-        starts["excess"] = Variable(
-            at.best_limits,
-            ("start", "limit"),
-            "1",
+        text = (
             "negative: satisfied; value over limit - 1 of a metric in the worst scenario, for the "
-            "loop a smooth figure that has the same sign, on the worst machine of the tuning",
+            "loop a smooth figure that has the same sign, on the worst machine of the tuning"
         )
-    return starts
+        made.put("excess", at.best_limits, "1", text, "start", "limit")
 
 
-def _fresh(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
-    axis, both = ("scenario",), ("family", "scenario")
-    fresh = {}
+def _put_fresh(made: Variables, spec: TuneSpec, findings: TuneFindings) -> None:
+    """The best designs and the baseline on fresh machines, and as their files run."""
+    axis, both = "scenario", ("family", "scenario")
     for name, column in fresh_columns(spec).items():
         array = as_numbers(column, spec.study.n_links)
-        dims = tuple(f"{name}_{k}" for k in range(1, array.ndim))
         entry = parse_entry(name)
-        unit = field_unit(entry.field) if entry else "1"
-        fresh[name] = Variable(array, (*axis, *dims), unit, name)
+        dims = (axis, *(f"{name}_{k}" for k in range(1, array.ndim)))
+        made.put(name, array, field_unit(entry.field) if entry else "1", name, *dims)
+    judged, baseline = findings.judged, findings.baseline
+    text = "objective, fresh machines"
+    made.put("fresh_objective", np.stack([x.objective for x in judged]), "1", text, *both)
+    made["fresh_status"] = Variable(np.stack([x.status for x in judged]), both, *STATUS_LABEL)
+    made["baseline_status"] = Variable(baseline.status, (axis,), *STATUS_LABEL)
+    for name, values in baseline.metrics.items():
+        unit, text = _unit_and_text(spec, name)
+        each = np.stack([x.metrics[name] for x in judged])
+        made.put(f"fresh_{name}", each, unit, f"{text}, fresh machines", *both)
+        made.put(f"baseline_{name}", values, unit, f"{text}, fresh machines, the baseline", axis)
+        own = [x.own_run.metrics[name] for x in judged]
+        made.put(f"file_{name}", own, unit, f"{text}, as the file runs", "family")
+        before, text = baseline.own_run.metrics[name], f"{text}, the baseline's file as it runs"
+        made.put(f"file_baseline_{name}", before, unit, text)
 
-    def each(field: str) -> np.ndarray:
-        return np.stack([getattr(design, field) for design in findings.judged])
 
-    fresh["fresh_objective"] = Variable(each("objective"), both, "1", "objective, fresh machines")
-    fresh["fresh_status"] = Variable(each("status"), both, *STATUS_LABEL)
-    fresh["baseline_status"] = Variable(findings.baseline.status, axis, *STATUS_LABEL)
+def _unit_and_text(spec: TuneSpec, name: str) -> tuple[str, str]:
     links = links_text(spec.counted_links, spec.study.n_links)
-    for name, baseline in findings.baseline.metrics.items():
-        unit = METRICS[name.partition("[")[0]].unit
-        values = np.stack([design.metrics[name] for design in findings.judged])
-        text = name if parse_entries(name).names_a_link else f"{name}, largest of {links}"
-        fresh[f"fresh_{name}"] = Variable(values, both, unit, f"{text}, fresh machines")
-        fresh[f"baseline_{name}"] = Variable(
-            baseline, axis, unit, f"{text}, fresh machines, the baseline"
-        )
-        values = np.array([design.own_run.metrics[name] for design in findings.judged])
-        fresh[f"file_{name}"] = Variable(values, ("family",), unit, f"{text}, as the file runs")
-        before = np.array(findings.baseline.own_run.metrics[name])
-        fresh[f"file_baseline_{name}"] = Variable(
-            before, (), unit, f"{text}, the baseline's file as it runs"
-        )
-    if findings.baseline.loop is not None:
+    text = name if parse_entries(name).names_a_link else f"{name}, largest of {links}"
+    return METRICS[name.partition("[")[0]].unit, text
+
+
+def _put_loops(made: Variables, spec: TuneSpec, findings: TuneFindings) -> None:
+    """Figures of the loop: of the nominal machine, and on fresh ones those that count."""
+    judged, baseline = findings.judged, findings.baseline
+    if baseline.loop is not None:
         for name in dict.fromkeys((*OF_EVERY_LOOP, *spec.loop_names)):
-            label = f"{name.replace('_', ' ')} of the linearised loop, nominal machine"
-            values = np.array([_loop_figure(design, name) for design in findings.judged])
-            fresh[name] = Variable(values, ("family",), LOOP_UNITS[name], label)
-            baseline = np.array(_loop_figure(findings.baseline, name))
-            fresh[f"baseline_{name}"] = Variable(
-                baseline, (), LOOP_UNITS[name], f"{label}, the baseline"
-            )
-    return fresh | _fresh_loops(spec, findings)
-
-
-def _fresh_loops(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
-    """Figures of the loop that the objective or a limit names, on the fresh machines."""
-    of_scenario, variables = loop_machines(spec, fresh_columns(spec)).of_scenario, {}
-    for name in filter(findings.baseline.fresh_loop.__contains__, spec.loop_names):
-        label, unit = f"{name.replace('_', ' ')} of the linearised loop", LOOP_UNITS[name]
-        values = np.stack([design.fresh_loop[name][of_scenario] for design in findings.judged])
-        variables[f"fresh_{name}"] = Variable(
-            values, ("family", "scenario"), unit, f"{label}, fresh machines"
-        )
-        variables[f"fresh_baseline_{name}"] = Variable(
-            findings.baseline.fresh_loop[name][of_scenario],
-            ("scenario",),
-            unit,
-            f"{label}, fresh machines, the baseline",
-        )
-    return variables
+            unit = LOOP_UNITS[name]
+            text = f"{name.replace('_', ' ')} of the linearised loop, nominal machine"
+            made.put(name, [_loop_figure(x, name) for x in judged], unit, text, "family")
+            own = _loop_figure(baseline, name)
+            made.put(f"baseline_{name}", own, unit, f"{text}, the baseline")
+    of_scenario = loop_machines(spec, fresh_columns(spec)).of_scenario
+    for name in filter(baseline.fresh_loop.__contains__, spec.loop_names):
+        unit = LOOP_UNITS[name]
+        text = f"{name.replace('_', ' ')} of the linearised loop, fresh machines"
+        each = np.stack([x.fresh_loop[name][of_scenario] for x in judged])
+        made.put(f"fresh_{name}", each, unit, text, "family", "scenario")
+        own, text = baseline.fresh_loop[name][of_scenario], f"{text}, the baseline"
+        made.put(f"fresh_baseline_{name}", own, unit, text, "scenario")
 
 
 def _loop_figure(judged: JudgedDesign, name: str) -> float:
     return float("nan") if judged.loop is None else float(getattr(judged.loop, name))
 
 
-def _random(findings: TuneFindings) -> dict[str, Variable]:
-    search = findings.searched
-    if search is None:
-        return {}
-    return {
-        "search_objective": Variable(
-            search.objective, ("sample",), "1", "objective of random designs"
-        ),
-        "search_linear_residual": Variable(
-            search.linear, ("sample",), "m", "linear residual vibration of random designs"
-        ),
-    }
-
-
-def _references(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
+def _put_references(made: Variables, spec: TuneSpec, findings: TuneFindings) -> None:
     """No control, and the gain factor alone."""
-    links, references = links_text(spec.counted_links, spec.study.n_links), {}
-    scan, axis = findings.references.scan, ("scanned",)
-    designs = findings.references.uncontrolled, findings.references.gain_alone
-    for label, text, design in zip(
-        ("uncontrolled", "gain_alone"), (WITHOUT, ALONE), designs, strict=True
-    ):
+    references, axis = findings.references, "scenario"
+    designs = references.uncontrolled, references.gain_alone
+    labels = zip(("uncontrolled", "gain_alone"), (WITHOUT, ALONE), designs, strict=True)
+    for label, what, design in labels:
         if design is None:
             continue
-        references[f"{label}_objective"] = Variable(
-            design.objective, ("scenario",), "1", f"objective, fresh machines, {text}"
-        )
-        references[f"{label}_status"] = Variable(design.status, ("scenario",), *STATUS_LABEL)
+        text = f"objective, fresh machines, {what}"
+        made.put(f"{label}_objective", design.objective, "1", text, axis)
+        made[f"{label}_status"] = Variable(design.status, (axis,), *STATUS_LABEL)
         for name, values in design.metrics.items():
-            unit = METRICS[name.partition("[")[0]].unit
-            what = name if parse_entries(name).names_a_link else f"{name}, largest of {links}"
-            references[f"{label}_{name}"] = Variable(
-                values, ("scenario",), unit, f"{what}, fresh machines, {text}"
-            )
-            references[f"file_{label}_{name}"] = Variable(
-                np.array(design.own_run.metrics[name]),
-                (),
-                unit,
-                f"{what}, the baseline's run, {text}",
-            )
-    if scan is not None:
+            unit, text = _unit_and_text(spec, name)
+            made.put(f"{label}_{name}", values, unit, f"{text}, fresh machines, {what}", axis)
+            own, text = design.own_run.metrics[name], f"{text}, the baseline's run, {what}"
+            made.put(f"file_{label}_{name}", own, unit, text)
+    if (scan := references.scan) is not None:
         best = scan.gain_factor[scan.best] if scan.best >= 0 else np.nan
-        references |= {
-            "gain_alone_factor": Variable(np.array(best), (), "1", f"control.gain_factor, {ALONE}"),
-            "scanned_gain_factor": Variable(scan.gain_factor, axis, "1", "control.gain_factor"),
-            "scanned_objective": Variable(
-                scan.objective, axis, "1", "objective with that gain factor alone"
-            ),
-            "scanned_excess": Variable(
-                scan.excess, axis, "1", "largest excess over limits of metrics then, 0: kept"
-            ),
-        }
-    return references
+        made.put("gain_alone_factor", best, "1", f"control.gain_factor, {ALONE}")
+        made.put("scanned_gain_factor", scan.gain_factor, "1", "control.gain_factor", "scanned")
+        text = "objective with that gain factor alone"
+        made.put("scanned_objective", scan.objective, "1", text, "scanned")
+        text = "largest excess over limits of metrics then, 0: kept"
+        made.put("scanned_excess", scan.excess, "1", text, "scanned")

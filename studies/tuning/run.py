@@ -50,8 +50,6 @@ from studies.tuning.results import variables
 from studies.tuning.spec import TuneSpec
 from studies.tuning.workers import ClusterEvaluator
 
-#: From so many differentiated runs an iteration on, workers of this machine are worth their start.
-LARGE = 64
 #: Share of the evaluations of a descent that the comparison of its derivatives takes.
 SHARE = 0.1
 #: Modules that determine the numbers of a tuning, with everything they import.
@@ -80,7 +78,7 @@ def run_tuning(
         is_resumed: continue the existing tuning.
         console: where progress goes; default: standard output.
         is_quiet: hide progress.
-        workers: as in `run_sweep`.
+        workers: as in `run_sweep`; default: this process.
         evaluator: of all starting points, in place of workers.
 
     Returns:
@@ -94,14 +92,12 @@ def run_tuning(
     out = Path(out)
     console = console or Console(highlight=False, markup=False)
     manifest = make_manifest(spec.data, DECISIVE)
-    n_runs = len(start_families(spec)) * spec.tune.scenarios.count * len(spec.moves)
-    is_large = evaluator is None and n_runs >= LARGE
 
     phases = Phases(console, tune_phases(spec), is_quiet)
     remote = partial(ClusterEvaluator, spec, phases.say)
     with (
         phases,
-        on_workers(workers, is_large, phases.say, remote) as found,
+        on_workers(workers, False, phases.say, remote) as found,
         open_tuning(out, manifest, is_resumed) as before,
     ):
         if before is not None and not is_compatible(spec, before):

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from studies.config import start
-from studies.show.document import AsJson, print_document
+from studies.results.document import AsJson, print_document
 
 if TYPE_CHECKING:
     from studies.twin.result import TwinResult
@@ -45,9 +45,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         quiet = Console(quiet=True) if as_json else console
         result = twin_design(loaded, out, quiet)
         if as_json:
-            from studies.twin.report import document
+            from studies.twin.report import twin_document
 
-            print_document("twin", document(result))
+            print_document(twin_document(result))
             return
         _print_twin(result, console)
 

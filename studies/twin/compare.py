@@ -13,6 +13,7 @@ from studies.engine.controller import check_codable
 from studies.engine.preflight import check_run
 from studies.engine.runs import Run, run_study, uncontrolled_twin
 from studies.errors import StudyError, field_error
+from studies.results.labelled import Labelled, derived, labelled, told
 from studies.study.cases import build_structure, has_stretch
 from studies.study.labels import describe
 from studies.study.spec import Study
@@ -53,16 +54,15 @@ class BothRuns(NamedTuple):
     controlled: BothModels
 
 
-class Gap(NamedTuple):
-    """A quantity in the window after the reference trajectory, rms."""
+class Gap(Labelled):
+    """A quantity in the window after the reference trajectory, rms in its unit, entry by entry."""
 
-    ours: np.ndarray  # in the unit of the quantity, (n,): by link, for instance
-    theirs: np.ndarray  # (n,)
-    difference: np.ndarray  # (n,)
+    ours: np.ndarray = labelled("1", "by this model", "entry")
+    theirs: np.ndarray = labelled("1", "by the twin", "entry")
+    difference: np.ndarray = labelled("1", "of both", "entry")
 
-    @property
+    @derived("1", "difference over theirs", "entry")
     def share(self) -> np.ndarray:
-        """Difference over theirs [1], (n,)."""
         return np.divide(
             self.difference,
             self.theirs,
@@ -70,20 +70,21 @@ class Gap(NamedTuple):
             where=self.theirs > 0,
         )
 
-    @property
+    @derived("1", "difference over theirs, all entries together")
     def whole(self) -> float:
-        """Difference over theirs, all entries together [1]."""
         size = float(np.linalg.norm(self.theirs))
         return float(np.linalg.norm(self.difference)) / size if size > 0 else float("nan")
 
 
-class ChangedRun(NamedTuple):
-    """One thing changed: the differences that are then left [1], NaN where it changes nothing."""
+class ChangedRun(Labelled):
+    """One thing changed: the relative differences that are then left, null where it changes
+    nothing.
+    """
 
-    text: str
-    free: float  # mid-span deflection without control, all links
-    controlled: float  # with control
-    voltage: float
+    text: str = told("what is changed")
+    free: float = labelled("1", "of mid-span deflections without control, all links")
+    controlled: float = labelled("1", "with control")
+    voltage: float = labelled("1", "of voltages")
 
 
 def check_supported(study: Study) -> None:

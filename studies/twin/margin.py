@@ -6,11 +6,10 @@ exported with a larger `control.gain_factor`; converters do not round, so that t
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from studies.results.labelled import Labelled, labelled, told
 from studies.study.spec import Study
 from studies.twin.law import exported_law
 from studies.twin.loop import TwinRun, run_twin
@@ -40,13 +39,13 @@ CONFIRMED = 0.01
 MOST_RUNS, HIGHEST = 8, 50.0
 
 
-class GrowthMargin(NamedTuple):
+class GrowthMargin(Labelled):
     """Where the loop begins to grow."""
 
-    margin: float  # factor on all gains [1]; NaN: not found
-    frequency: float  # of what grows [Hz]
-    is_confirmed: bool  # signals grow 1 % beyond it and decay 1 % below it
-    runs: int
+    margin: float = labelled("1", "factor on all gains; null: not found")
+    frequency: float = labelled("Hz", "of what grows")
+    is_confirmed: bool = told("growth was seen 1 % beyond it, decay 1 % below")
+    runs: int = told("that it took")
 
 
 def ring(
@@ -166,14 +165,14 @@ def margin_by_growth(
     above = search.pole(high, None)
     while above.real <= 0:
         if search.runs == MOST_RUNS:
-            return nothing._replace(runs=search.runs)
+            return nothing.replace(runs=search.runs)
         high *= STRIDE
         above = search.pole(high, None)
     low = min(predicted * (1 - NEAR), high / STRIDE**0.5)
     below = search.pole(low, above)
     while below.real >= 0:
         if search.runs == 2 * MOST_RUNS:
-            return nothing._replace(runs=search.runs)
+            return nothing.replace(runs=search.runs)
         high, above = low, below
         low /= STRIDE
         below = search.pole(low, above)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from studies.results.labelled import Labelled, labelled, told
 from studies.show.pages import page
 from studies.show.words import control_text, motion_text
 from studies.study.margin import margin_text
+from studies.study.spec import Study
 from studies.twin.compare import BothModels, ChangedRun, Gap, deflection, gap, place, turn, voltage
+from studies.twin.margin import GrowthMargin
 from studies.twin.result import FIGURE, TwinResult
 
 GAP_HEAD = ("after the motion, rms", "this model", "twin", "difference", "of the twin's")
@@ -24,14 +27,35 @@ CAUSE_HEAD = (
 POLE_HEAD = ("linearised loop", "this model", "twin", "difference")
 
 
-class ComparedQuantity(NamedTuple):
+class ComparedQuantity(Labelled):
     """A quantity of both models."""
 
-    name: str
-    unit: str  # SI
-    is_controlled: bool
-    gap: Gap
-    entries: tuple[str, ...]
+    name: str = told("of the quantity")
+    unit: str = told("SI symbol")
+    is_controlled: bool = told("with control")
+    gap: Gap = told("in that window, rms in that unit")
+    entries: tuple[str, ...] = told("what the numbers of each list belong to")
+
+
+class TwinDocument(Labelled, command="twin", version=2):
+    """What `studies twin --json` prints and `twin.json` holds: a run by this model beside its twin
+    in Exudyn.
+    """
+
+    title: str = told("of the study")
+    verdict: str = told("the comparison in a sentence")
+    exudyn: str = told("version of Exudyn")
+    elements_per_link: int = told("at least")
+    steps_per_sample: int = told("of the twin")
+    command_end: float = labelled("s", "end of the reference trajectory")
+    window_length: float = labelled("s", "of the samples after it that are compared")
+    compared: list[ComparedQuantity] = told("in that window")
+    changes: list[ChangedRun] = told("with one thing changed; the first entry: nothing")
+    damping_ratio: np.ndarray = labelled("1", "of the first modes, linearised loop", "mode")
+    twin_damping_ratio: np.ndarray = labelled("1", "the same of the twin, by decay", "mode")
+    gain_margin: float = labelled("1", "factor on control.gain_factor, of the linearised loop")
+    growth: GrowthMargin = told("the same of the twin, by growth")
+    study: Study = told("the study compared, complete")
 
 
 def compared(result: TwinResult) -> list[ComparedQuantity]:
@@ -83,7 +107,10 @@ def gap_rows(result: TwinResult) -> list[list[str]]:
             texts = (f"{factor * x:.4g} {unit}" for x in numbers)
             rows.append([f"{one.name}, {entry}, {control}", *texts, _percent(one.gap.share[k])])
         if len(one.entries) > 1:
-            together = (float(np.linalg.norm(x)) / len(x) ** 0.5 for x in one.gap)
+            together = (
+                float(np.linalg.norm(x)) / len(x) ** 0.5
+                for x in (one.gap.ours, one.gap.theirs, one.gap.difference)
+            )
             texts = (f"{factor * x:.4g} {unit}" for x in together)
             rows.append([f"{one.name}, all together, {control}", *texts, _percent(one.gap.whole)])
     return rows
@@ -141,50 +168,25 @@ def verdict(result: TwinResult) -> str:
     )
 
 
-def document(result: TwinResult) -> dict[str, Any]:
-    """All numbers, in SI units."""
-    ours, theirs = damping_ratios(result)
-    period, window = result.plan.electronics.period, result.window
-    return {
-        "title": result.study.title,
-        "verdict": verdict(result),
-        "exudyn": result.version,
-        "elements_per_link": result.settings.n_elements,
-        "steps_per_sample": result.plan.n_steps,
-        "command_end": result.plan.command_end,
-        "window_length": (window.stop - window.start) * period,
-        "compared": [
-            {
-                "quantity": one.name,
-                "unit": one.unit,
-                "with_control": one.is_controlled,
-                "entries": one.entries,
-                "rms_ours": one.gap.ours,
-                "rms_theirs": one.gap.theirs,
-                "rms_difference": one.gap.difference,
-                "relative": one.gap.share,
-                "relative_all": one.gap.whole,
-            }
-            for one in compared(result)
-        ],
-        "changes": [
-            {
-                "change": one.text,
-                "deflection_without_control": one.free,
-                "deflection_with_control": one.controlled,
-                "voltage": one.voltage,
-            }
-            for one in result.causes
-        ],
-        "damping_ratio": {"ours": ours, "theirs": theirs},
-        "gain_margin": {
-            "ours": float(result.loop.gain_margin),
-            "theirs": result.growth.margin,
-            "frequency_hz": result.growth.frequency,
-            "is_confirmed": result.growth.is_confirmed,
-        },
-        "study": result.study.model_dump(mode="json"),
-    }
+def twin_document(result: TwinResult) -> TwinDocument:
+    """The document of a comparison."""
+    window = result.window
+    return TwinDocument(
+        title=result.study.title,
+        verdict=verdict(result),
+        exudyn=result.version,
+        elements_per_link=result.settings.n_elements,
+        steps_per_sample=result.plan.n_steps,
+        command_end=float(result.plan.command_end),
+        window_length=(window.stop - window.start) * result.plan.electronics.period,
+        compared=compared(result),
+        changes=result.causes,
+        damping_ratio=damping_ratios(result)[0],
+        twin_damping_ratio=damping_ratios(result)[1],
+        gain_margin=float(result.loop.gain_margin),
+        growth=result.growth,
+        study=result.study,
+    )
 
 
 def report(result: TwinResult, images: Path | None = None) -> str:

@@ -11,7 +11,7 @@ from studies.engine.design import Design, as_design
 from studies.engine.progress import Phases
 from studies.engine.runs import resolved_study
 from studies.publish import REPORT, announce, check_folder, publish
-from studies.show.document import json_text
+from studies.results.document import json_text
 from studies.show.figures import draw
 from studies.study.spec import Study
 from studies.twin.compare import BothRuns, TwinBench, causes, check_supported, our_runs, pair
@@ -19,7 +19,7 @@ from studies.twin.law import check_compiler
 from studies.twin.margin import first_modes, margin_by_growth, ring
 from studies.twin.multibody import DEFAULT, Settings, load_exudyn
 from studies.twin.plots import side_by_side
-from studies.twin.report import document, report
+from studies.twin.report import report, twin_document
 from studies.twin.result import FIGURE, TwinResult, expected_poles
 
 DOCUMENT = "twin.json"
@@ -96,7 +96,6 @@ def twin_design(
 
 def _write(out: Path, result: TwinResult) -> None:
     with publish(out) as staging:
-        text = json_text("twin", document(result))
-        (staging / DOCUMENT).write_text(text, encoding="utf-8")
+        (staging / DOCUMENT).write_text(json_text(twin_document(result)), encoding="utf-8")
         draw(staging, {FIGURE: partial(side_by_side, result.plan, result.runs)})
         (staging / REPORT).write_text(report(result, staging), encoding="utf-8")

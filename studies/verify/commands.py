@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
 from studies.config import start
-from studies.show.document import AsJson, print_document
+from studies.results.document import AsJson, print_document
 
 if TYPE_CHECKING:
     from studies.verify.run import ModelVerification
@@ -38,20 +38,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
         found = verify_study(None if study is None else load_study(study), notify)
         if as_json:
-            print_document("verify", verify_document(found))
+            print_document(found)
         else:
             _print(found, console)
         if not found.is_passed:
             sys.exit(1)
-
-
-def verify_document(found: ModelVerification) -> dict[str, Any]:
-    """What `studies verify` says."""
-    rows = [
-        {**row._asdict(), "outcome": row.outcome, "left_out": row.left_out or None}
-        for row in found.rows
-    ]
-    return {"is_passed": found.is_passed, **found.summary._asdict(), "table": rows}
 
 
 def _print(found: ModelVerification, console: Console) -> None:
@@ -64,13 +55,13 @@ def _print(found: ModelVerification, console: Console) -> None:
         table.add_column(name, overflow="fold")
     for name in ["difference", "allowed", ""]:
         table.add_column(name, no_wrap=True)
-    for row in found.rows:
+    for row in found.table:
         numbers = ["-", "-"] if row.left_out else [f"{row.difference:.1e}", f"{row.allowed:.0e}"]
         style = None if row.is_passed else "bold red"
         texts = [row.assumption, row.against, row.source][: 1 + len(wide)]
         table.add_row(*texts, *numbers, row.outcome, style=style)
     console.print(table)
-    for row in found.rows:
+    for row in found.table:
         if row.left_out or not row.is_passed:
             why = row.left_out or row.note or "the difference is larger than allowed"
             console.print(f"{row.outcome}: {row.assumption}: {why}", soft_wrap=True)

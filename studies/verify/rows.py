@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
+from studies.results.labelled import Labelled, derived, told
 
-class Assumption(NamedTuple):
+
+class Assumption(Labelled):
     """An assumption, what it is checked against, and how far apart both are."""
 
-    assumption: str
-    against: str
-    source: str  # author and year
-    difference: float  # relative, or a count; NaN: it could not be computed
-    allowed: float
-    left_out: str = ""  # why there is nothing to check, "" if there is
-    note: str = ""  # what went wrong, or a figure that helps
+    assumption: str = told("what the model assumes")
+    against: str = told("what it was checked against")
+    source: str = told("author and year")
+    difference: float = told("relative, or a count; null: it could not be computed")
+    allowed: float = told("largest difference")
+    left_out: str = told("why there was nothing to check, empty if there was", default="")
+    note: str = told("what went wrong, or a figure that helps", default="")
 
     @property
     def is_passed(self) -> bool:
         """Whether the difference is allowed, or there was nothing to check."""
         return bool(self.left_out) or bool(self.difference <= self.allowed)
 
-    @property
-    def outcome(self) -> str:
-        """In a word."""
+    @derived("", "in a word")
+    def outcome(self) -> Literal["passed", "FAILED", "left out"]:
         if self.left_out:
             return "left out"
         return "passed" if self.is_passed else "FAILED"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from datetime import datetime
-from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from studies.config import processor_text, require_configured
 from studies.engine.preflight import check_run
 from studies.errors import StudyError
 from studies.passport import Passport
+from studies.results.labelled import Labelled, derived, told, unwritten
 from studies.study.spec import Study, paper_study
 from studies.verify.links import check_links
 from studies.verify.loops import check_loops
@@ -33,21 +33,21 @@ CHECKS: dict[str, Callable[[Study], list[Assumption]]] = {
 }
 
 
-class ModelVerification(NamedTuple):
-    """All rows of a verification."""
+class ModelVerification(Labelled, command="verify", version=2):
+    """What `studies verify --json` prints: every assumption of the model, what it was checked
+    against and how far apart both are.
+    """
 
-    study: Study
-    rows: tuple[Assumption, ...]
+    study: Study = unwritten()
+    table: tuple[Assumption, ...] = told("a row for each assumption")
 
-    @property
+    @derived("", "whether no row failed; the exit code is 1 otherwise")
     def is_passed(self) -> bool:
-        """Whether no row failed."""
-        return all(row.is_passed for row in self.rows)
+        return all(row.is_passed for row in self.table)
 
-    @property
+    @derived("", "the outcome as later reports show it")
     def summary(self) -> Passport:
-        """The outcome as later reports show it."""
-        checked = [row for row in self.rows if not row.left_out]
+        checked = [row for row in self.table if not row.left_out]
         failed = tuple(row.assumption for row in checked if not row.is_passed)
         return Passport(
             title=self.study.title,

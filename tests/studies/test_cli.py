@@ -250,7 +250,7 @@ def test_reports_that_cannot_be_are_refused_before_the_run(capsys, tmp_path):
 
 def columns(document):
     """Frequencies [Hz], damping ratios and descriptions of the modes in a document."""
-    rows = ([x["frequency_hz"], x["damping_ratio"], x["description"]] for x in document["modes"])
+    rows = ([x["frequency"], x["damping_ratio"], x["description"]] for x in document["modes"])
     return tuple(zip(*rows, strict=True))
 
 
@@ -258,7 +258,7 @@ def test_modes_as_json_and_as_table(capsys, tmp_path):
     code, out, err = run(capsys, "modes", "--modes", 2, "--json")
     found = json.loads(out)
     assert (code, err) == (0, "")
-    assert list(found) == ["format", "format_version", "modes", "units"]
+    assert list(found) == ["format", "format_version", "modes"]
     frequency, ratio, names = map(list, columns(found))
     moves = [f"drive, platform {x}, 100 %" for x in ("translates", "translates", "turns")]
     assert names[:9] == [
@@ -298,9 +298,9 @@ def test_modes_name_their_link():
     assert free.names[3:] == by_thickness and all("drive" in name for name in free.names[:3])
     rigid = machine_modes(study, kp=0.0)
     assert rigid.names == ["rigid motion"] * 3 + by_thickness
-    assert [x.links for x in rigid.kinds] == [(), (), ()] + [(3,), (1,), (2,)] * 2
+    assert [x.links for x in rigid.modes] == [(), (), ()] + [(3,), (1,), (2,)] * 2
     largest = rigid.link_share[3:].max(axis=(1, 2))
-    np.testing.assert_allclose([x.share for x in rigid.kinds[3:]], largest)
+    np.testing.assert_allclose([x.share for x in rigid.modes[3:]], largest)
 
 
 @pytest.mark.parametrize(
@@ -323,7 +323,7 @@ def test_shares_of_modes_are_what_their_frequencies_gain_from_stiffness(thicknes
     found = machine_modes(study)
     of_link = gained(link__stiffness_factor=lambda x: (1.0, 1.0 + x, 1.0))
     of_drive = gained(drive__kp=lambda x: 2e4 * (1 + x))
-    assert [x.kind for x in found.kinds[9:]] == ["stretch"] * 3 * stretch
+    assert [x.kind for x in found.modes[9:]] == ["stretch"] * 3 * stretch
     alone = np.arange(9 + 3 * stretch)
     kinds = [slice(0, 3), slice(3, 6), slice(6, 9)] if thickness == 2e-3 else alone
     for kind in kinds:
@@ -548,13 +548,7 @@ def test_the_version_is_that_of_the_package(capsys):
     assert run(capsys, "--version") == (0, f"flexlink-studies {studies.__version__}\n", "")
 
 
-#: Modules that need an optional package.
-CLUSTER = [
-    "studies.cluster.runner",
-    "studies.cluster.worker",
-    "studies.screen.workers",
-    "studies.tuning.workers",
-]
+#: Packages of extras.
 OPTIONAL = ("distributed", "dask", "diffrax", "pyuff", "blackjax", "control")
 
 
@@ -572,7 +566,7 @@ def imported(path):
 
 
 def test_only_what_runs_on_a_cluster_imports_its_package():
-    """`tune` and the rest work after an install without extras."""
+    """When it is used: all commands work after an install without extras."""
     files = (sources.TOP / "studies").rglob("*.py")
     modules = {".".join(x.relative_to(sources.TOP).with_suffix("").parts): x for x in files}
     imports = {module: imported(path) for module, path in modules.items()}
@@ -580,7 +574,7 @@ def test_only_what_runs_on_a_cluster_imports_its_package():
     while found != lacking:  # also what imports these
         lacking = found
         found = {module for module, names in imports.items() if names & {*OPTIONAL, *lacking}}
-    assert sorted(lacking) == CLUSTER
+    assert not lacking
 
 
 @pytest.mark.long  # in short: as the files say
@@ -599,7 +593,7 @@ for module in pkgutil.walk_packages(studies.__path__, "studies."):
 print(*sorted(lacking))
 """
     run = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=120)
-    assert run.stdout.split() == CLUSTER, run.stderr
+    assert run.stdout.split() == [], run.stderr
 
 
 def test_workers_are_named_again_as_they_were():

@@ -13,12 +13,15 @@ import typer
 
 from jaxmodel import status
 from studies.cli import app
+from studies.documents import DOCUMENTS, schema
 from studies.engine import results
-from studies.engine.breaking import TOLERANCES, BreakingChange, ChangedNumber
+from studies.engine.breaking import TOLERANCES
 from studies.engine.design import Design
 from studies.engine.runs import uncontrolled_twin
 from studies.errors import StudyError
-from studies.show.document import documented, json_text, schema
+from studies.results.breaking import BreakingChange, ChangedNumber
+from studies.results.document import json_text
+from studies.results.labelled import Labelled, labelled, told
 from studies.single.run import simulate
 from studies.sweeps.sensitivity import analyse
 from tests.studies.sweeps.test_sweep_tables import (
@@ -80,8 +83,8 @@ def test_every_document_has_a_schema():
         for name, command in group.commands.items()
         if any("--json" in parameter.opts for parameter in command.params)
     }
-    assert readers | WRITERS == set(documented())
-    for command in documented():
+    assert readers | WRITERS == set(DOCUMENTS)
+    for command in DOCUMENTS:
         rules = schema(command)
         jsonschema.Draft202012Validator.check_schema(rules)
         assert rules["title"] == rules["properties"]["format"]["const"] == f"flexlink-{command}"
@@ -118,7 +121,7 @@ def test_best_with_what_breaks_each(capsys, document, monkeypatch):
         change=None,
         parts=(ChangedNumber("delay", "delay 0.5 samples late", 2.0),),
         breaking="mode 3 of link 1 (958 Hz)",
-        tolerances=units,
+        tolerances=units._asdict(),
     )
     monkeypatch.setattr(breaking, "load_design", lambda folder, case: Design(case, {}))
 
@@ -150,7 +153,7 @@ def test_show(document):
     counts = {row["status"]: row["cases"] for row in found["statuses"]}
     assert counts == {0: 5, 3: 1, 5: 1, -1: 1}
     assert [case["case"] for case in found["best"]["cases"]] == [1, 0, 5, 2]  # margins above 2
-    assert found["best"]["subject_to"] == "gain_margin >= 2" and "failed" not in found
+    assert found["best"]["subject_to"] == "gain_margin >= 2" and found["failed"] is None
     assert found["causes"][0]["name"] == "control.gain_factor"
     failed = document("show", "DIR", "--failed", data=data)["failed"]
     assert [(x["case"], x["status"], x["bad_time"]) for x in failed] == [(4, 3, 4e-3), (6, 5, None)]
@@ -213,30 +216,38 @@ def test_a_mistake_leaves_stdout_empty(capsys, tmp_path):
 
 
 def test_what_json_cannot_hold():
-    text = json_text(
-        "x",
-        {
-            "numbers": np.array([[1.0, np.nan], [np.inf, 2.0]]),
-            "one": np.float32(0.5),
-            "count": np.int64(3),
-            "is_on": np.bool_(True),
-            "bytes": b"abc",
-            "title": "\x9b31m \u202e",
-            "pair": (1, None),
-        },
-        version=7,
+    class Odd(Labelled, command="odd", version=7):
+        """What JSON has no words for."""
+
+        numbers: np.ndarray = labelled("1", "with gaps", "row", "column")
+        one: float = labelled("1", "in single precision")
+        count: int = told("of NumPy")
+        is_on: bool = told("the same")
+        words: bytes = told("as bytes")
+        title: str = told("with escapes")
+        pair: tuple[int, None] = told("of two kinds")
+
+    odd = Odd(
+        numbers=np.array([[1.0, np.nan], [np.inf, 2.0]]),
+        one=np.float32(0.5),
+        count=np.int64(3),
+        is_on=np.bool_(True),
+        words=b"abc",
+        title="\x9b31m \u202e",
+        pair=(1, None),
     )
+    text = json_text(odd)
     assert text.isascii() and "NaN" not in text
     found = json.loads(text)
     assert found["numbers"] == [[1.0, None], [None, 2.0]] and found["pair"] == [1, None]
-    assert (found["one"], found["count"], found["is_on"], found["bytes"]) == (0.5, 3, True, "abc")
-    assert (found["format"], found["format_version"]) == ("flexlink-x", 7)
+    assert (found["one"], found["count"], found["is_on"], found["words"]) == (0.5, 3, True, "abc")
+    assert (found["format"], found["format_version"]) == ("flexlink-odd", 7)
 
 
 def test_schemas_are_printed(capsys):
     code, out, _ = run(capsys, "schema")
-    assert code == 0 and out.split() == documented()
-    for command in documented():
+    assert code == 0 and out.split() == list(DOCUMENTS)
+    for command in DOCUMENTS:
         assert json.loads(run(capsys, "schema", command)[1]) == schema(command)
     assert "did you mean 'best'?" in refused(capsys, "schema", "bst")
     assert "command = 'x/../best'" in refused(capsys, "schema", "x/../best")
@@ -244,13 +255,13 @@ def test_schemas_are_printed(capsys):
 
 def test_a_schema_refuses_a_wrong_unit_of_nesting():
     rules, case = schema("best"), {"case": 1, "case_id": "a", "residual_rms": 1e-6}
-    whole = {"format": "flexlink-best", "format_version": 1, "by": "residual_rms"}
+    whole = {"format": "flexlink-best", "format_version": 2, "by": "residual_rms"}
     whole |= {"direction": "smallest", "subject_to": "", "without_control": None, "cases": [case]}
     whole |= {"units": {"residual_rms": "m"}, "left_out": [], "warnings": []}
-    whole |= {"environments": [], "over": "worst"}
+    whole |= {"environments": [], "over": "worst", "smallest_changes": None}
     jsonschema.validate(whole, rules)
-    for change in ({"case": -1}, {"case": "1"}, {"case_id": 3}, {"residual_rms": {"um": 1}}):
+    for name, part in (("cases", {"residual_rms": {"um": 1}}), ("units", {"residual_rms": 1})):
         wrong = copy.deepcopy(whole)
-        wrong["cases"][0] |= change
+        wrong[name] = [part] if name == "cases" else part
         with pytest.raises(jsonschema.ValidationError):
             jsonschema.validate(wrong, rules)

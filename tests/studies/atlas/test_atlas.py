@@ -1,5 +1,6 @@
 """The atlas: shares against their definition, modes and responses against the machine's own."""
 
+import dataclasses
 import io
 from functools import partial
 from itertools import permutations
@@ -194,8 +195,8 @@ def test_vibration_after_a_command_that_ends_the_run(atlas):
     found = atlas[1]
     runs, end = found.platform, found.platform.command_end.max()
     kept = runs.time < end + 0.02
-    short = runs._replace(time=runs.time[kept], vibration=runs.vibration[:, :, kept])
-    figure = figures.FIGURES["vibration"](found._replace(platform=short))
+    short = runs.replace(time=runs.time[kept], vibration=runs.vibration[:, :, kept])
+    figure = figures.FIGURES["vibration"](found.replace(platform=short))
     late = (short.time >= end + 0.01) & (short.time < end + 0.015)
     column = int(np.argmax(runs.command_end))
     for k, ax in enumerate(figure.axes[column:6:2]):
@@ -278,11 +279,11 @@ def test_a_pose_out_of_reach_is_refused():
 
 
 def test_the_squared_margin_falls_below_zero_out_of_reach():
-    empty = workspace.Map(*[np.zeros(0)] * len(workspace.Map._fields))
+    empty = workspace.Map(*[np.zeros(0)] * len(dataclasses.fields(workspace.Map)))
     lift = np.sin([[0.2, 0.7, 0.7], [1.4, 0.7, 0.7], [-0.2, 0.7, 0.7], [0.7, 0.7, 0.7]])
     lift[3, 1] = 1.5
     wanted = [0.2**2, (np.pi / 2 - 1.4) ** 2, -(0.2**2), -1.0]
-    np.testing.assert_allclose(empty._replace(lift=lift).squared_margin, wanted, rtol=1e-9)
+    np.testing.assert_allclose(empty.replace(lift=lift).squared_margin, wanted, rtol=1e-9)
 
 
 def test_the_map_of_interactions_is_in_per_cent():

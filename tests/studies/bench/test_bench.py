@@ -64,7 +64,7 @@ def test_gradient_figures(monkeypatch, capsys):
     monkeypatch.setitem(WORKS["W0"], "control__modes", 1)
     monkeypatch.setattr("studies.bench.works.REPEATS", 1)
     cli.main(["bench", "--work", "grad", "--batch", "16", "--json"])
-    found = json.loads(capsys.readouterr().out)
+    found = json.loads(capsys.readouterr().out)["figures"]
     assert set(KEYS.split()) <= set(found)
     assert found["parameters"] == 3 and found["configs_per_s"] > 0 < found["fingerprint"]
 
@@ -90,7 +90,7 @@ def test_single_precision_is_measured_against_double(capsys):
             cli.main(command)
     finally:
         jax.config.update("jax_enable_x64", True)
-    found = json.loads(capsys.readouterr().out)
+    found = json.loads(capsys.readouterr().out)["figures"]
     assert found["dtype"] == "float32"
     assert 1e-9 < found["error"]["residual_rms"] < 1
 

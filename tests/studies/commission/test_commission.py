@@ -11,11 +11,12 @@ from rich.console import Console
 
 from studies.commission import run as commissioning
 from studies.commission import stages
+from studies.commission.findings import CommissionFindings
 from studies.commission.machines import Possible, margin_spread, margins_on, unknown_to_controller
-from studies.commission.report import CommissionFindings, summary
 from studies.commission.run import run_commission
 from studies.commission.spec import LOUDER, RESERVE, load_measured, parse_measured, tuning_section
 from studies.commission.stages import STAGES, possible_machines
+from studies.documents import schema
 from studies.engine.controller import fixed_controller
 from studies.engine.design import Design
 from studies.engine.fast_motion import TellingMotion, make_fast
@@ -24,7 +25,6 @@ from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.export.firmware import build as building
 from studies.fitting.spec import load_fit
-from studies.show.document import schema
 from studies.spillover.certificate import certify
 from studies.tuning.folder import open_tuning
 from studies.tuning.spec import parse_tuning
@@ -150,7 +150,7 @@ def test_gains_are_lowered_until_later_stages_find_their_margins(monkeypatch, tm
     study = STUDY.change(control__gain_factor=2.0)
     lowered = stages._lowered(study, AS_BUILT, measured)
     certificate = certify(lowered, 2.0, (study.link.basis,))
-    assert certificate.is_passed and np.nanmin(certificate.margin) < 2.1
+    assert certificate.is_passed and certificate.smallest_margin < 2.1
     monkeypatch.setattr(stages, "load_design", lambda folder: Design(study, {}))
     price = stages.price_text(tmp_path, lowered)
     assert re.match(r"lowered from 2, .* is 0\.\d+ instead of 0\.\d+", price)
@@ -227,7 +227,7 @@ def commissioned(out, is_resumed=False):
     jsonschema.validate(document, schema("commission"))
     page = (out / "report.html").read_text()
     parsed(page)
-    assert document["is_good"] == made.is_good and document["summary"] == summary(made.outcome)
+    assert document["is_good"] == made.is_good and document["summary"] == made.summary
     return made, text.getvalue(), text_of(page)
 
 
@@ -258,7 +258,7 @@ def test_all_stages_lead_to_firmware(monkeypatch, tmp_path):
 def test_what_is_not_supported_is_refused(monkeypatch, answers, last, reason, tmp_path):
     pretended = Pretended(monkeypatch, **answers)
     made, text, page = commissioned(tmp_path / "out")
-    assert not made.is_good and pretended.calls[-1] == last == made.outcome.done
+    assert not made.is_good and pretended.calls[-1] == last == made.last_stage
     (refusal,) = (line for line in text.splitlines() if line.startswith("REFUSED"))
     assert re.search(reason, refusal)
     assert "To measure next: hammer 2 at the pose (0, 0.01, 0.5)." in text
@@ -331,7 +331,7 @@ def test_missing_tools_are_found_before_the_fit(monkeypatch, tmp_path):
 
 def test_what_the_data_leave_open_is_said():
     fit = FIT | {"messages": ["Two links can be exchanged."]}
-    lines = summary(CommissionFindings(None, fit=fit))
+    lines = CommissionFindings(None, "", fit=fit).summary
     assert "Left open by the data: Two links can be exchanged." in lines
     assert lines[-1].startswith("To measure next: hammer 2")
 
@@ -353,9 +353,9 @@ def test_a_machine_made_by_a_richer_model(seed, tmp_path):
     whole, true = measured_data(tmp_path, seed, is_elements, target="c")
     measured = parse_measured(whole, tmp_path)
     made = run_commission(measured, tmp_path / "out")
-    assert made.is_good, made.outcome.refusals
+    assert made.is_good, made.refusals
     assert len(possible_machines(tmp_path / "out").values) == 64
-    tuned, fast = made.outcome.tuned, make_fast(true)
+    tuned, fast = made.tuned, make_fast(true)
     assert margin_on(true, tuned) >= 2
     best = tuned_on(true, measured, tmp_path / "best", Console(quiet=True))
     residual, least = (residual_on(fast, x) for x in (tuned, best))

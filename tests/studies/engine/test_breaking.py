@@ -11,12 +11,13 @@ from jaxmodel.changes import MachineChange, changed_case
 from jaxmodel.linear import linearise, resting
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import analogue_plant, closed_loop
+from studies.documents import schema
 from studies.engine import breaking
 from studies.engine.breaking import TOLERANCES, parse_tolerances, smallest_change
 from studies.engine.controller import fixed_controller
 from studies.engine.nearest import Loops, _pulled, growth, nearest_unstable
 from studies.errors import StudyError
-from studies.show.document import plain, schema
+from studies.results.labelled import plain
 from studies.study.cases import as_arrays, build_case, build_structure
 from tests.canonical import MACHINE, study_of
 from tests.evolution import cma_es
@@ -332,7 +333,7 @@ def test_patches_stay_on_their_links_and_apart():
 
 def test_the_record_is_that_of_its_schema(found):
     whole = schema("spillover")["properties"]["smallest_change"]
-    jsonschema.validate(plain(found.record()), whole)
+    jsonschema.validate(plain(found), whole)
 
 
 # --- campaigns ------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ import pytest
 from rich.console import Console
 from scipy.stats import chi2
 
+from studies.documents import schema
 from studies.errors import StudyError
 from studies.fitting import run
 from studies.fitting.bench import Modes
@@ -22,7 +23,6 @@ from studies.fitting.run import run_fit
 from studies.fitting.solve import SAME, Solution, exchanges
 from studies.fitting.spec import load_fit
 from studies.fitting.statistics import UNKNOWN, describe_fit
-from studies.show.document import schema
 from studies.tuning.spec import load_tuning
 from tests import TOP
 from tests.fits import ASKEW, FREQUENCY, RESPONSE, answered, blank, made, posed, spec_of, write

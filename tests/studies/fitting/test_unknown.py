@@ -8,10 +8,10 @@ import pytest
 from rich.console import Console
 from scipy.stats import chi2
 
+from studies.documents import schema
 from studies.errors import StudyError
 from studies.fitting.estimate import fit
 from studies.fitting.run import run_fit
-from studies.show.document import schema
 from tests.fits import (
     FREQUENCY,
     MAGNITUDE,

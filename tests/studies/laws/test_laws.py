@@ -16,8 +16,9 @@ from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import check_law
 from jaxmodel.loop_figures import MARGINS
 from jaxmodel.table import PartError
+from studies.documents import schema
 from studies.engine.chunks import distinct_loops, judge_cases
-from studies.engine.columns import labelled
+from studies.engine.columns import named
 from studies.engine.margins import judge_loops
 from studies.engine.results import SweepData
 from studies.errors import StudyError
@@ -55,7 +56,7 @@ from studies.laws.tuning import (
     tune_candidate,
     tuning_of,
 )
-from studies.show.document import schema
+from studies.results.labelled import plain
 from studies.space.table import build_table
 from studies.study.cases import build_cases, build_structure
 from studies.study.spec import Study
@@ -279,7 +280,7 @@ def test_what_says_how_far_a_tuning_has_come(own_law):
     )
     wanted = Quality(0.5, 2, 0.2, (spec.free.numbers[-1].name,))
     found = _quality(spec, at)
-    assert found._replace(late_gain=round(found.late_gain, 12)) == wanted
+    assert plain(found.replace(late_gain=round(found.late_gain, 12))) == plain(wanted)
     unkept = at._replace(history=np.stack([objective, violation + 1], axis=-1))
     assert np.isnan(_quality(spec, unkept).late_gain)
 
@@ -339,7 +340,7 @@ def test_what_breaks_is_told_of_the_machine_with_the_least_gain_margin():
     }
     names = (*MARGINS, "status", *FIGURES, *SHOWN)
     arrays = dict.fromkeys(names, np.zeros(9)) | columns
-    variables = {name: labelled(name, x) for name, x in arrays.items()}
+    variables = {name: named(name, x, "case") for name, x in arrays.items()}
     data = SweepData(variables, {}, None, SimpleNamespace(origin=np.arange(9)))
     with mock.patch.object(judging, "read_sweep", lambda _: data):
         (text,) = read_judged(None, 1, 3).breaking
@@ -418,11 +419,11 @@ def test_a_comparison_writes_a_page_whose_order_is_that_of_the_runs(tmp_path, co
     assert findings.name(findings.ranking.best) == "strong + PD"
     document = json.loads((tmp_path / "out" / "laws.json").read_text())
     jsonschema.validate(document, schema("laws"))
-    names = [entry["name"] for entry in document["controllers"]]
+    names = [entry["controller"]["name"] for entry in document["controllers"]]
     assert names[:2] == ["strong + PD", "weak + PD"]
     own = findings.judged.metrics["residual_rms"]
     wanted = np.exp(np.log(own[2] / own[3]).mean())  # weak over strong, by the definition
-    weak = next(x for x in document["controllers"] if x["name"] == "weak + PD")
+    weak = next(x for x in document["controllers"] if x["controller"]["name"] == "weak + PD")
     assert weak["ratio"]["residual_rms"][0] == pytest.approx(wanted)
     page = (tmp_path / "out" / "report.html").read_text()
     (table,) = tables_of(page)["Their tunings"]
@@ -431,10 +432,12 @@ def test_a_comparison_writes_a_page_whose_order_is_that_of_the_runs(tmp_path, co
     assert document["tunings"][2] == {
         "name": "PD",
         "numbers_tuned": 1,
-        "objective": 0.7,
-        "n_alike": 3,
-        "late_gain": None,
-        "at_bound": ["drive.kp"],
+        "quality": {
+            "objective": 0.7,
+            "n_alike": 3,
+            "late_gain": None,
+            "at_bound": ["drive.kp"],
+        },
     }
     assert "strong + PD" in page
     strong = document["controllers"][0]
@@ -446,7 +449,7 @@ def test_a_comparison_writes_a_page_whose_order_is_that_of_the_runs(tmp_path, co
     assert 0 < strong["rms_voltage"] < strong["peak_voltage"]
     assert strong["residual_rms"] == pytest.approx(np.exp(np.log(own[3]).mean()))
     assert beyond_budget(findings, 3) == ""
-    tight = findings._replace(budget=findings.budget._replace(voltage=1e-3, margin=1.99))
+    tight = findings._replace(budget=findings.budget.replace(voltage=1e-3, margin=1.99))
     text = beyond_budget(tight, 3)
     assert "(tuned to 0.001 V)" in text and "a disk margin below 1.99 on" in text
     html = findings._repr_html_()

@@ -18,6 +18,7 @@ from rich.console import Console
 
 from studies.atlas import atlas_sweep, read_subsets
 from studies.cli import main
+from studies.documents import schema
 from studies.engine.preflight import check_run
 from studies.engine.runs import run_study
 from studies.errors import StudyError
@@ -31,7 +32,6 @@ from studies.papers.zhang_2016.cases import ALL, MOVES, OFF, ONE, SHAPERS, TWO, 
 from studies.papers.zhang_2016.claims import CLAIMS, LEFT_OPEN
 from studies.papers.zhang_2016.context import Context, Machines
 from studies.papers.zhang_2016.measures import measure
-from studies.show.document import schema
 from studies.show.figures import comparison
 from studies.show.units import span
 from studies.store import read_store
@@ -126,7 +126,7 @@ def test_status_of_every_case_is_written(short):
 def test_outcome_of_every_claim_is_printed_and_kept(short):
     found = json.loads((short.folder / "claims.json").read_text(encoding="utf-8"))
     jsonschema.validate(found, schema("paper"))
-    assert [claim["text"] for claim in found["claims"]] == [x.text for x in CLAIMS]
+    assert [one["claim"]["text"] for one in found["claims"]] == [x.text for x in CLAIMS]
     assert {claim["outcome"] for claim in found["claims"]} == {"holds", "fails"}
     page = text_of((short.folder / "report.html").read_text(encoding="utf-8"))
     for claim in found["claims"]:

@@ -40,7 +40,7 @@ def test_a_card_says_what_it_tests(card):
     assert card.claims and card.left_open and card.read
     texts = [claim.text for claim in card.claims]
     assert len({*texts}) == len(texts)
-    assert all(all(claim) for claim in card.claims)
+    assert all(x.text and x.quantity and x.condition for x in card.claims)
 
 
 def test_outcomes():

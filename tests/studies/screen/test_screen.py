@@ -6,7 +6,7 @@ import pytest
 from jaxmodel import status
 from jaxmodel.sampled_loop import closed_loop
 from studies.engine import screen
-from studies.engine.columns import LEFT_OUT, labelled
+from studies.engine.columns import LEFT_OUT, named
 from studies.engine.executor import Executor
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.results import metric_values, read_sweep
@@ -287,7 +287,7 @@ def test_cases_that_saturate_do_not_meet_the_screens_condition(monkeypatch, tmp_
 
     def further(codes):
         arrays = {"status": np.array(codes), "residual_rms": np.full((8, 3, 3), 1e-9)}
-        made_up = {x: labelled(x, a) for x, a in arrays.items()}
+        made_up = {x: named(x, a, "case") for x, a in arrays.items()}
         monkeypatch.setattr(screen, "gather", lambda *_: made_up)
         return screen.next_round(table, order, spec, first, tmp_path)
 

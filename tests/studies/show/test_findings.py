@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from jaxmodel import status
+from studies.results.document import json_text
+from studies.results.labelled import plain
 from studies.spillover.certificate import Certificate
 from studies.spillover.fast_move import ControlEffect
 from studies.spillover.plants import ModelMismatch, PlantVariant
-from studies.spillover.report import document, residual_text, verdict
 from studies.spillover.report import report as certificate_report
+from studies.spillover.report import residual_text
 from studies.study.margin import margin_in_db
 from studies.tuning.audit import Disagreement
 from studies.tuning.check import JudgedDesign, OwnRun, patch_centers
@@ -55,17 +57,17 @@ def certificate(required=2.0, **changes):
         x[~exists] = np.nan
     values = {
         "study": STUDY,
-        "required": required,
+        "required_margin": required,
         "n_controlled": 2,
-        "plants": plants,
+        "variants": plants,
         "exists": exists,
-        "radius": np.where(exists, rng.uniform(0.9, 0.99, shape), np.nan),
-        "margin": np.where(exists, rng.uniform(2.5, 9, shape), np.nan),
-        "frequency_hz": frequency,
+        "spectral_radius": np.where(exists, rng.uniform(0.9, 0.99, shape), np.nan),
+        "gain_margin": np.where(exists, rng.uniform(2.5, 9, shape), np.nan),
+        "frequency": frequency,
         "damping_ratio": damping,
-        "free_damping": free,
-        "weakest": np.array([f"weak {k}" for k in range(12)]).reshape(shape),
-        "breaking": np.array([f"breaks {k}" for k in range(12)]).reshape(shape),
+        "free_damping_ratio": free,
+        "least_damped": np.array([f"weak {k}" for k in range(12)]).reshape(shape),
+        "broken_by": np.array([f"breaks {k}" for k in range(12)]).reshape(shape),
         "observation": rng.normal(size=(2, 3, 3, 2, largest)),
         "actuation": rng.normal(size=(2, 3, 3, largest, 2)),
         "notes": ("left out: something",),
@@ -75,7 +77,7 @@ def certificate(required=2.0, **changes):
 
 def fast_move(**changes):
     rms = 1e-6 * np.array([[1.5, 2.5, 0.5], [30.0, 20.0, 40.0]])
-    return ControlEffect(STUDY, rms, np.array([status.OK, status.OK]))._replace(**changes)
+    return ControlEffect(STUDY, rms, np.array([status.OK, status.OK])).replace(**changes)
 
 
 def test_a_certificate_s_table_of_plants():
@@ -99,11 +101,11 @@ def test_a_certificate_s_table_of_plants():
         "frequencies x 0.9, J_C = 2e-06 kg m2",
     )
     assert table["model mismatch"] == [words[d] for _, d in order]
-    assert_cells(table["gain margin"], found.margin[:, :, 1].ravel(), 3)
-    assert_cells(table["with 2 modes"][:5], found.margin[:, :, 0].ravel()[:5], 3)
+    assert_cells(table["gain margin"], found.gain_margin[:, :, 1].ravel(), 3)
+    assert_cells(table["with 2 modes"][:5], found.gain_margin[:, :, 0].ravel()[:5], 3)
     assert table["with 2 modes"][5] == "-"  # there is no such plant
-    assert table["broken by"] == found.breaking[:, :, 1].ravel().tolist()
-    assert table["least damped"] == found.weakest[:, :, 1].ravel().tolist()
+    assert table["broken by"] == found.broken_by[:, :, 1].ravel().tolist()
+    assert table["least damped"] == found.least_damped[:, :, 1].ravel().tolist()
     least = found.damping_ratio[:, :, 1].reshape(6, -1).min(axis=1)
     assert_cells(table["smallest damping ratio"], least, 3)
     assert table["passes"] == ["yes"] * 6
@@ -171,32 +173,31 @@ def test_a_certificate_says_what_control_leaves(changes, sentence):
     assert text.startswith("CONTROL MAKES IT WORSE: ") == is_worse
     words = " ".join(text_of(certificate_report(found)).split())
     assert text[1:] in words[: words.index("**Question:**")]
-    kept = json.loads(document(found))["fast_move"]
-    rms = found.fast_move.residual_rms[0]
-    assert kept["residual_rms_m"] == [None if np.isnan(x) else x for x in rms]
+    kept = json.loads(json_text(found))["fast_move"]
+    assert kept["residual_rms"] == plain(found.fast_move.residual_rms)
 
 
 def test_a_certificate_without_a_fast_move_says_nothing_of_it():
     found = certificate()
-    assert residual_text(found) == "" and json.loads(document(found))["fast_move"] is None
+    assert residual_text(found) == "" and json.loads(json_text(found))["fast_move"] is None
     assert "The fast move" not in certificate_report(found)
 
 
 def test_a_certificate_s_sentences():
     found = certificate()
-    margin = np.nanmin(found.margin)
+    margin = np.nanmin(found.gain_margin)
     words = text_of(certificate_report(found))
-    at = found.plants[np.unravel_index(np.nanargmin(found.margin), found.margin.shape)]
-    free = found.free_damping
-    last = found.margin[:, :, 1]
-    change = np.nanmax(np.abs(found.margin[:, :, 0] / last - 1))
+    at = found.variants[np.unravel_index(np.nanargmin(found.gain_margin), found.gain_margin.shape)]
+    free = found.free_damping_ratio
+    last = found.gain_margin[:, :, 1]
+    change = np.nanmax(np.abs(found.gain_margin[:, :, 0] / last - 1))
     shown = margin_in_db(margin, 3)
     for part in (
         f"# Spillover certificate passed: gain margin {shown}, 2 required",
         "is its controller stable on 11 plants that differ",
         f"**Result:** safe on 11 of 11 plants (1 more left out, see below): gain margin "
         f"{shown} on the worst, 2 required; what goes unstable first: "
-        f"{found.breaking[found.worst]}.",
+        f"{found.broken_by[found.worst]}.",
         "basis pinned_pinned, 2 controlled modes per link on links 1+3, gain factor 0.4;",
         f"Smallest margin: {shown}, on {at.basis}, {at.n_modes} modes per link, {at.mismatch}.",
         f"Margins with 2 and 5 plant modes per link differ by up to {100 * change:.2g} %.",
@@ -208,23 +209,23 @@ def test_a_certificate_s_sentences():
 
 @pytest.mark.parametrize("required", [2.0, 2.75, 3.0])
 def test_a_margin_equal_to_the_required_one_passes(required):
-    margin = certificate().margin
+    margin = certificate().gain_margin
     margin[margin < 3.5] = 3.5
     margin[0, 1, 1] = required
-    found = certificate(required, margin=margin)
+    found = certificate(required, gain_margin=margin)
     assert found.is_passed and found.passes.sum() == 11 and found.fails_from == 0
     assert found.worst == (0, 1, 1)
     margin[0, 1, 1] = np.nextafter(required, 0)
-    found = certificate(required, margin=margin)
+    found = certificate(required, gain_margin=margin)
     assert not found.is_passed and found.passes.sum() == 10 and found.fails_from == 5
     margin[1, 0] = 1.5
-    assert certificate(required, margin=margin).fails_from == 2
+    assert certificate(required, gain_margin=margin).fails_from == 2
 
 
 def test_an_unstable_plant_fails_whatever_its_margin():
-    radius = certificate().radius
+    radius = certificate().spectral_radius
     radius[1, 0, 0] = 1 + 1e-5
-    found = certificate(radius=radius)
+    found = certificate(spectral_radius=radius)
     assert not found.is_passed and found.fails_from == 2
     table = tables_of(certificate_report(found))["Margins and damping"][0]
     assert table["passes"] == ["yes"] * 3 + ["**no**"] + ["yes"] * 2
@@ -235,86 +236,88 @@ def test_a_certificate_names_the_uncontrolled_mode_that_control_makes_worst():
     found = certificate()
     first = text_of(certificate_report(found)).partition("**Question:**")[0]
     assert found.spillover is None and "ontrol spillover" not in first
-    assert json.loads(document(found))["spillover"] is None
+    assert json.loads(json_text(found))["spillover"] is None
     zeta = found.damping_ratio.copy()
-    zeta[0, 2, 1, 3, 1] = 0.8 * found.free_damping[0, 2, 1, 3, 1]
-    zeta[1, 1, 1, 4, 2] = 0.5 * found.free_damping[1, 1, 1, 4, 2]  # the worst
-    zeta[1, 0, 1, 1, 0] = 0.1 * found.free_damping[1, 0, 1, 1, 0]  # controlled
-    worse = found._replace(damping_ratio=zeta)
+    zeta[0, 2, 1, 3, 1] = 0.8 * found.free_damping_ratio[0, 2, 1, 3, 1]
+    zeta[1, 1, 1, 4, 2] = 0.5 * found.free_damping_ratio[1, 1, 1, 4, 2]  # the worst
+    zeta[1, 0, 1, 1, 0] = 0.1 * found.free_damping_ratio[1, 0, 1, 1, 0]  # controlled
+    worse = found.replace(damping_ratio=zeta)
     at = worse.spillover
-    assert (at.mode, at.plant) == (5, found.plants[1, 1, 1])
+    plant = found.variants[1, 1, 1]
+    assert (at.mode, at.basis, at.n_modes) == (5, plant.basis, plant.n_modes)
+    assert at.mismatch == str(plant.mismatch)
     assert at.damping_ratio == zeta[1, 1, 1, 4, 2]
-    assert at.free_damping == found.free_damping[1, 1, 1, 4, 2]
+    assert at.free_damping == found.free_damping_ratio[1, 1, 1, 4, 2]
     text = text_of(certificate_report(worse))
     sentence = (
         f"Control spillover: mode 5, which is not controlled, has a damping ratio of "
         f"{at.damping_ratio:.2g} instead of {at.free_damping:.2g} without control"
     )
     assert sentence in text[: text.index("**Question:**")]
-    kept = json.loads(document(worse))["spillover"]
+    kept = json.loads(json_text(worse))["spillover"]
     assert kept["mode"] == 5 and kept["damping_ratio"] == pytest.approx(at.damping_ratio)
-    assert kept["damping_ratio_without_control"] == pytest.approx(at.free_damping)
-    assert (kept["basis"], kept["modes"]) == (at.plant.basis, 5)
+    assert kept["free_damping"] == pytest.approx(at.free_damping)
+    assert (kept["basis"], kept["n_modes"]) == (at.basis, 5)
 
 
 def test_a_failed_certificate_says_what_would_pass():
-    margin = certificate().margin
+    margin = certificate().gain_margin
     margin[1, 1, 0] = 1.5
-    found = certificate(margin=margin)
-    assert verdict(found) == "failed by breaks 8: gain margin 1.5, 2 required"
+    found = certificate(gain_margin=margin)
+    assert found.verdict == "failed by breaks 8: gain margin 1.5, 2 required"
     words = text_of(certificate_report(found))
     assert "with its gains scaled by 0.75 the controller would pass" in words
     assert "`control.gain_factor = 0.3`" in words and "**not safe** on 10 of 11 plants" in words
     margin[1, 1, 0] = 0
-    words = text_of(certificate_report(certificate(margin=margin)))
+    words = text_of(certificate_report(certificate(gain_margin=margin)))
     assert "no gain passes: choose another basis or velocity estimator, or another law" in words
-    passed = verdict(certificate())
+    passed = certificate().verdict
     at = certificate().worst
     assert passed == (
-        f"passed: gain margin {certificate().margin[at]:.3g}, 2 required; first to go unstable "
-        f"beyond it: {certificate().breaking[at]}"
+        f"passed: gain margin {certificate().gain_margin[at]:.3g}, 2 required; first to go "
+        f"unstable beyond it: {certificate().broken_by[at]}"
     )
 
 
 def test_a_certificate_s_document_has_every_number():
     found = certificate(fast_move=fast_move())
-    data = json.loads(document(found))
-    assert data["required_margin"] == 2 and data["is_passed"] and data["fails_from_modes"] is None
-    assert data["smallest_margin"] == np.nanmin(found.margin)
-    assert data["verdict"] == verdict(found) and data["notes"] == list(found.notes)
+    data = json.loads(json_text(found))
+    assert data["required_margin"] == 2 and data["is_passed"] and data["fails_from"] == 0
+    assert data["smallest_margin"] == np.nanmin(found.gain_margin)
+    assert data["verdict"] == found.verdict and data["notes"] == list(found.notes)
     assert data["title"] == "this" and data["study"] == STUDY.model_dump(mode="json")
     wanted = []
     for at in np.ndindex(found.exists.shape):
         if not found.exists[at]:
             continue
-        plant = found.plants[at]
-        n, true = plant.n_modes, plant.mismatch
+        true = found.variants[at].mismatch
         wanted.append(
             {
-                "basis": plant.basis,
-                "modes": n,
-                "sensor_length_factor": true.sensor,
-                "actuator_length_factor": true.actuator,
+                "basis": found.variants[at].basis,
+                "plant_modes": found.variants[at].n_modes,
+                "mismatch": str(true),
+                "sensor_factor": true.sensor,
+                "actuator_factor": true.actuator,
                 "frequency_factor": true.frequency,
-                "joint_inertia_c_kg_m2": true.joint_inertia or 0.0,
+                "joint_inertia_c": [true.joint_inertia or 0.0] * 3,
                 "passes": True,
-                "spectral_radius": found.radius[at],
-                "gain_margin": found.margin[at],
-                "broken_by": found.breaking[at],
-                "least_damped": found.weakest[at],
-                "frequency_hz": found.frequency_hz[at][:n].tolist(),
-                "damping_ratio": found.damping_ratio[at][:n].tolist(),
-                "damping_ratio_without_control": found.free_damping[at][:n].tolist(),
+                "spectral_radius": found.spectral_radius[at],
+                "gain_margin": found.gain_margin[at],
+                "broken_by": found.broken_by[at],
+                "least_damped": found.least_damped[at],
+                "frequency": plain(found.frequency[at]),
+                "damping_ratio": plain(found.damping_ratio[at]),
+                "free_damping_ratio": plain(found.free_damping_ratio[at]),
             }
         )
     assert data["plants"] == wanted
     move = found.fast_move
     assert data["fast_move"] == {
-        "move_time_s": move.move_time,
-        "residual_rms_m": move.residual_rms[0].tolist(),
-        "residual_rms_without_control_m": move.residual_rms[1].tolist(),
-        "run": "ok",
-        "run_without_control": "ok",
+        "residual_rms": move.residual_rms.tolist(),
+        "status": [status.OK, status.OK],
+        "control": ["on", "off"],
+        "move_time": move.move_time,
+        "ended": ["ok", "ok"],
     }
 
 

@@ -12,7 +12,7 @@ from studies.space import table as tables
 from studies.space.table import build_table, designs
 from studies.study.fields import _LAWS, _RULES, idle_axes
 from studies.study.spec import Study
-from studies.sweeps.dry_run import axis_records
+from studies.sweeps.dry_run import axes_of
 from studies.sweeps.run import run_sweep
 from tests.canonical import MACHINE
 from tests.studies.test_cli import run
@@ -173,4 +173,4 @@ axes = { link_subsets = ["none"], gain = [0.5, 2.0] }
     assert code == 0 and "1 case (0 left out by where, 1 duplicates, " in out
     assert "no metric depends on control.gain_factor with control.links false" in out
     table = build_table(small_spec({"axes": {"link_subsets": "all"}}))
-    assert [x["name"] for x in axis_records(table)] == ["link_subsets"]
+    assert [x.name for x in axes_of(table)] == ["link_subsets"]

@@ -25,9 +25,10 @@ from jaxmodel.modal_loop import law_poles, law_response
 from jaxmodel.mode_tail import bound_tail, static_rest
 from jaxmodel.prepare import prepare
 from jaxmodel.zero_exclusion import NEAR, prepare_exclusion, return_difference
+from studies.documents import schema
 from studies.engine.controller import fixed_controller
 from studies.engine.stability import gain_margin
-from studies.show.document import schema
+from studies.results.document import json_text
 from studies.spillover import ModelMismatch, certify
 from studies.spillover import proofs as proofs_module
 from studies.spillover.plants import (
@@ -52,7 +53,7 @@ from studies.spillover.proofs import (
     prove_box,
     volume,
 )
-from studies.spillover.report import document, report, verdict
+from studies.spillover.report import report
 from tests.pages import text_of
 from tests.proofs import ONE_MOVE, many_modes_loop, random_design, spectral_radius
 
@@ -529,7 +530,7 @@ def test_statements_say_what_is_proven():
     )
     assert second.startswith("proven: no unstable machine for stiffness of the links x 0.95 to")
     texts = [
-        proof_texts(PROVEN._replace(box=PROVEN.box._replace(**changes)))[1]
+        proof_texts(PROVEN.replace(box=PROVEN.box.replace(**changes)))[1]
         for changes in (
             {"undecided": 0.25},
             {"undecided": 1.0, "unstable": (0.95, 1.0, 0.1)},
@@ -539,24 +540,24 @@ def test_statements_say_what_is_proven():
     assert texts[0].startswith("undecided on 25 % of the box")
     assert texts[1].startswith("UNSTABLE machine in the box") and "x 0.95, 1 sample of" in texts[1]
     assert texts[2].endswith("no bound")
-    none = PROVEN._replace(all_modes=AllModes(0.0, 0.19, LARGEST, "no bound"))
+    none = PROVEN.replace(all_modes=AllModes(0.0, 0.19, LARGEST, "no bound"))
     assert proof_texts(none)[0] == "not proven for every number of modes: no bound"
 
 
 def test_certificates_hold_their_proofs():
     found = certify(STUDY, sizes=(3,), bases=(SINES,), mismatches=(ModelMismatch(),))
     for proofs in (None, PROVEN):
-        found = found._replace(proofs=proofs)
-        data = json.loads(document(found))
+        found = found.replace(proofs=proofs)
+        data = json.loads(json_text(found))
         jsonschema.validate(data, schema("spillover"))
         assert (data["proofs"] is None) == (proofs is None)
         assert ("Proven: no unstable machine" in report(found)) == (proofs is not None)
-    assert data["proofs"]["box"]["is_proven"] and data["proofs"]["all_modes"]["gain_margin"] == 3.5
+    assert data["proofs"]["box"]["is_proven"] and data["proofs"]["all_modes"]["margin"] == 3.5
 
 
 def with_box(found, **changes):
     """A certificate with proofs about a box."""
-    return found._replace(proofs=PROVEN._replace(box=PROVEN.box._replace(**changes)))
+    return found.replace(proofs=PROVEN.replace(box=PROVEN.box.replace(**changes)))
 
 
 #: Its plants have a gain margin of 1.5, its delay margin is below one sample.
@@ -581,17 +582,17 @@ def test_an_unstable_machine_of_the_box_fails_a_design_whose_plants_pass(near):
     found, box = near
     assert found.is_passed and found.unstable_machine is None
     assert box.unstable == (1.0, 0.5, 0.05)  # the first one tried
-    failed = found._replace(proofs=PROVEN._replace(box=box))
+    failed = found.replace(proofs=PROVEN.replace(box=box))
     assert not failed.is_passed and failed.passes.all() and failed.fails_from == 0
     machine = "stiffness x 1, 0.5 samples of extra delay, 0.05 kg more payload"
-    assert verdict(failed) == (
+    assert failed.verdict == (
         f"failed by an unstable machine in the box: {machine}; on the plants: gain margin 1.5, "
         "1.2 required"
     )
-    data = json.loads(document(failed))
+    data = json.loads(json_text(failed))
     jsonschema.validate(data, schema("spillover"))
-    assert not data["is_passed"] and data["verdict"] == verdict(failed)
-    assert data["fails_from_modes"] is None
+    assert not data["is_passed"] and data["verdict"] == failed.verdict
+    assert data["fails_from"] == 0
     words = " ".join(text_of(report(failed)).split())
     first = words[: words.index("**Question:**")]
     assert "certificate failed: unstable machine in the box, gain margin 1.5" in first
@@ -606,14 +607,14 @@ def test_an_undecided_box_fails_nothing_and_is_said(near):
         ({"undecided": 1.0, "fault": "no bound"}, "nothing proven for stiffness"),
     ):
         found = with_box(near[0], **changes)
-        assert found.is_passed and verdict(found).startswith("passed: ")
+        assert found.is_passed and found.verdict.startswith("passed: ")
         words = " ".join(text_of(report(found)).split())
         assert f"In the box of machines: {said}" in words[: words.index("**Question:**")]
 
 
 def test_a_verdict_names_plant_and_machine_where_both_fail(near):
-    found = with_box(near[0]._replace(required=2.0), unstable=(1.0, 0.5, 0.05))
-    said = verdict(found)
+    found = with_box(near[0].replace(required_margin=2.0), unstable=(1.0, 0.5, 0.05))
+    said = found.verdict
     assert said.startswith("failed by ") and "gain margin 1.5, 2 required; unstable machine" in said
     assert said.endswith("stiffness x 1, 0.5 samples of extra delay, 0.05 kg more payload")
 
@@ -621,8 +622,8 @@ def test_a_verdict_names_plant_and_machine_where_both_fail(near):
 def test_an_unstable_machine_of_one_mode_is_not_hidden_by_others():
     """Of a law that is judged mode by mode, one of which has no proof."""
     boxes = [
-        PROVEN.box._replace(undecided=1.0, fault="no bound"),
-        PROVEN.box._replace(undecided=1.0, unstable=(0.95, 1.0, 0.1)),
+        PROVEN.box.replace(undecided=1.0, fault="no bound"),
+        PROVEN.box.replace(undecided=1.0, unstable=(0.95, 1.0, 0.1)),
         PROVEN.box,
     ]
     waiting = iter(boxes)

@@ -23,13 +23,15 @@ from jaxmodel.controller import (
 from jaxmodel.electronics import measurement_chain
 from jaxmodel.laws.lqr import optimal_gains
 from jaxmodel.laws.ppf import HIGHEST_RATIO, design_position_filter
-from studies.engine.breaking import TOLERANCES, BreakingChange, ChangedNumber
+from studies.documents import schema
+from studies.engine.breaking import TOLERANCES
 from studies.engine.controller import fixed_controller
 from studies.engine.fast_motion import FAST, WINDOW, make_fast
 from studies.engine.runs import run_study
 from studies.engine.stability import LoopFigures, loop_report
 from studies.errors import StudyError
-from studies.show.document import schema
+from studies.results.breaking import BreakingChange, ChangedNumber
+from studies.results.labelled import document
 from studies.spillover import ModelMismatch, certificate, certify, patch_lengths
 from studies.spillover import run as spillover_run
 from studies.spillover.fast_move import run_fast_move
@@ -76,35 +78,35 @@ def test_the_certificate_fails_what_is_known_to_be_unstable(difference):
     assert not difference.is_passed and difference.fails_from == 7
     np.testing.assert_array_equal(difference.passes.ravel(), [True, False])
     # numbers found elsewhere
-    np.testing.assert_allclose(difference.margin.ravel(), [5.97, 0.19], rtol=0.03)
-    assert difference.radius[0, 0, 1] > 1.1
-    broken_by = difference.breaking[difference.worst]
+    np.testing.assert_allclose(difference.gain_margin.ravel(), [5.97, 0.19], rtol=0.03)
+    assert difference.spectral_radius[0, 0, 1] > 1.1
+    broken_by = difference.broken_by[difference.worst]
     assert broken_by.startswith("mode 7 of link") and broken_by.endswith("(5605 Hz)")
     assert difference.least_damping[difference.worst] < 0
-    assert difference.weakest[difference.worst].startswith("mode 7 of link")
+    assert difference.least_damped[difference.worst].startswith("mode 7 of link")
 
 
 def test_verdicts_of_the_ladder_of_gains():
     """A quarter and a half of the paper's gains pass; the whole does not."""
     found = {f: certified({"control__gain_factor": f}, **HARD) for f in (0.5, 1.0, 2.0)}
     assert [one.is_passed for one in found.values()] == [True, True, False]
-    worst = [one.margin[one.worst] for one in found.values()]
+    worst = [one.gain_margin[one.worst] for one in found.values()]
     # the same loops, so margins go as 1/f
     np.testing.assert_allclose(np.array(worst) * list(found), 2 * worst[2], rtol=2e-4)
     paper = found[2.0]
-    assert paper.fails_from == 8 and np.all(paper.radius < 1)
+    assert paper.fails_from == 8 and np.all(paper.spectral_radius < 1)
     # at 1.2 kHz, where the modes above are springs
     wanted = r"a controller's filter at 1\d\d\d Hz, fed by modes 7\+9 of link 2 \(5605, 9265 Hz\)"
-    assert re.fullmatch(wanted, paper.breaking[paper.worst])
+    assert re.fullmatch(wanted, paper.broken_by[paper.worst])
     # eight modes say nearly what nine do; truncated, they say what was found elsewhere
-    np.testing.assert_allclose(paper.margin[0, 0], 1.441, rtol=0.025)
+    np.testing.assert_allclose(paper.gain_margin[0, 0], 1.441, rtol=0.025)
     truncated = certified({"control__gain_factor": 2.0, "link__static_correction": False}, **HARD)
-    np.testing.assert_allclose(truncated.margin[truncated.worst], 1.249, atol=2e-3)
+    np.testing.assert_allclose(truncated.gain_margin[truncated.worst], 1.249, atol=2e-3)
 
 
 def test_a_required_margin_decides():
     strict = certified({}, margin=3.0, **HARD)
-    assert not strict.is_passed and strict.required == 3.0
+    assert not strict.is_passed and strict.required_margin == 3.0
     with pytest.raises(StudyError, match="--margin = 1.0; allowed: more than 1"):
         certified({}, margin=1.0, **HARD)
 
@@ -114,21 +116,21 @@ def test_margins_and_damping_are_those_of_the_loop_report():
     structure = build_structure(STUDY)
     home = np.array(STUDY.motion.waypoints[0])
     report = loop_report(structure, as_arrays(build_case(STUDY)), home, n_modes=3)
-    np.testing.assert_allclose(one.margin[0, 0, 0], report.gain_margin, rtol=2e-4)
-    np.testing.assert_allclose(one.radius[0, 0, 0], report.spectral_radius, rtol=1e-9)
+    np.testing.assert_allclose(one.gain_margin[0, 0, 0], report.gain_margin, rtol=2e-4)
+    np.testing.assert_allclose(one.spectral_radius[0, 0, 0], report.spectral_radius, rtol=1e-9)
     for own, wanted in (
         (one.damping_ratio, report.damping_ratio),
-        (one.frequency_hz, report.frequency_hz),
+        (one.frequency, report.frequency_hz),
     ):
         own = np.sort(own[0, 0, 0, :3], axis=1)
         np.testing.assert_allclose(own, np.sort(wanted, axis=1), rtol=1e-6)
     # and, truncated with eight modes, those computed elsewhere
     one = certified({"link__static_correction": False}, sizes=(8,), **SAME)
-    np.testing.assert_allclose(20 * np.log10(one.margin[0, 0, 0]), 12.9, atol=0.1)
+    np.testing.assert_allclose(20 * np.log10(one.gain_margin[0, 0, 0]), 12.9, atol=0.1)
     zeta = one.damping_ratio[0, 0, 0].min(axis=1)
     np.testing.assert_allclose(zeta[:3], [0.248, 0.028, 0.011], atol=1e-3)
     # modes above half the sample rate keep their true frequency
-    np.testing.assert_allclose(one.frequency_hz[0, 0, 0, 7].mean(), 64 * 114.4, rtol=0.01)
+    np.testing.assert_allclose(one.frequency[0, 0, 0, 7].mean(), 64 * 114.4, rtol=0.01)
     np.testing.assert_allclose(zeta[7], 0.01, rtol=0.01)
 
 
@@ -162,8 +164,8 @@ def test_the_largest_leakage_is_named_by_its_modes_and_plant():
     """Of plants with one number of modes."""
     leakage = np.zeros((2, 2, 3, 2, 4))
     leakage[1, 0, 2, 1, 3], leakage[0, 1] = -0.7, np.nan
-    plants = np.array([["a", "b"], ["c", "d"]])[..., None]
-    found = _largest(SimpleNamespace(n_controlled=2, plants=plants), leakage)
+    variants = np.array([["a", "b"], ["c", "d"]])[..., None]
+    found = _largest(SimpleNamespace(n_controlled=2, variants=variants), leakage)
     assert found == {"size": 0.7, "mode": 6, "controlled": 2, "plant": "c"}
 
 
@@ -176,7 +178,7 @@ def test_plants_that_do_not_exist_are_left_out():
         mismatches=patch_lengths((1.0, 1.25)),
     )
     np.testing.assert_array_equal(found.exists[0, :, 0], [True, False] * 2)
-    assert np.all(np.isnan(found.margin[~found.exists])) and found.breaking[0, 1, 0] == ""
+    assert np.all(np.isnan(found.gain_margin[~found.exists])) and found.broken_by[0, 1, 0] == ""
     assert found.notes[0] == "left out: sensors x 1, actuators x 1.25: patches overlap"
     assert len(found.notes) == 2
     locked = STUDY.change(drive__locked=True, motion__waypoints=STUDY.motion.waypoints[:1])
@@ -208,9 +210,9 @@ def test_links_that_are_softer_and_joints_with_inertia():
         study = STUDY.change(link__modes=12, **changes)
         structure, case = build_structure(study), as_arrays(build_case(study))
         report = loop_report(structure, case, home, law=law)
-        np.testing.assert_allclose(found.margin[at][0], report.gain_margin, rtol=2e-4)
+        np.testing.assert_allclose(found.gain_margin[at][0], report.gain_margin, rtol=2e-4)
         np.testing.assert_allclose(
-            np.sort(found.frequency_hz[at][0, :3], axis=1),
+            np.sort(found.frequency[at][0, :3], axis=1),
             np.sort(report.frequency_hz, axis=1),
             rtol=1e-6,
         )
@@ -233,7 +235,7 @@ def test_damping_stands_beside_that_without_control():
     ratios = ((0.005,), (0.01,), (0.02,))
     changes = {"link__damping_ratio": ratios, "link__damping_law": "stiffness"}
     found = certified(changes, sizes=(3,), **SAME)
-    free = found.free_damping[0, 0, 0, :2]
+    free = found.free_damping_ratio[0, 0, 0, :2]
     np.testing.assert_allclose(np.sort(free[1]), [0.02, 0.04, 0.08], rtol=0.03)
     assert np.all(np.sort(found.damping_ratio[0, 0, 0, 0]) > 5 * np.sort(free[0]))
 
@@ -417,7 +419,7 @@ CHANGE = BreakingChange(
         ChangedNumber("E of link 1", "E of link 1 -7.2 %", -1.5),
     ),
     breaking="mode 3 of link 1 (958 Hz)",
-    tolerances=TOLERANCES,
+    tolerances=TOLERANCES._asdict(),
 )
 
 
@@ -430,7 +432,7 @@ def few(move):
     plants = {"bases": ("pinned_pinned",), "mismatches": patch_lengths((0.8, 1.0)), "sizes": (3, 9)}
     with mock.patch.multiple(
         spillover_run,
-        smallest_change=lambda design, units: CHANGE._replace(tolerances=units),
+        smallest_change=lambda design, units: CHANGE.replace(tolerances=units._asdict()),
         certify=lambda study, margin, bases: certify(study, margin, **plants),
         run_fast_move=lambda study: move,
     ):
@@ -479,12 +481,10 @@ def test_command_passes_a_design_and_writes_everything(capsys, tmp_path, move):
     data = json.loads((out / "certificate.json").read_text())
     jsonschema.validate(data, schema("spillover"))
     assert data["is_passed"] and len(data["plants"]) == 8
-    assert data["fast_move"]["residual_rms_m"] == move.residual_rms[0].tolist()
+    assert data["fast_move"]["residual_rms"] == move.residual_rms.tolist()
     assert "| delay | 0.5 samples late | +2.00 |" in report and "patch 0.0005 m," in report
-    assert data["smallest_change"] == CHANGE.record() | {
-        "changes": [part._asdict() for part in CHANGE.parts],
-        "tolerances": TOLERANCES._replace(patch=5e-4)._asdict(),
-    }
+    units = TOLERANCES._replace(patch=5e-4)._asdict()
+    assert data["smallest_change"] == document(CHANGE) | {"tolerances": units}
     assert all(plant["passes"] for plant in data["plants"])
     with xarray.open_dataset(out / "spillover.h5") as store:
         margin = store.gain_margin.sel(basis="pinned_pinned", plant_modes=9)

@@ -15,6 +15,7 @@ from studies.engine.results import read_sweep
 from studies.engine.runs import run_study
 from studies.errors import StudyError
 from studies.explore import explore_results
+from studies.results.labelled import Variables
 from studies.space.spec import parse_sweep
 from studies.store import read_store
 from studies.study import spec as spec_module
@@ -324,7 +325,8 @@ def test_each_family_has_one_best_start():
         best_limits=np.zeros((4, 1)),
     )
     with mock.patch.object(results, "patch_centers", lambda *_: 0.0):  # compiles
-        starts = results._starts(spec, SimpleNamespace(at=at, linear=np.full(4, np.nan)))
+        starts = Variables()
+        results._put_starts(starts, spec, SimpleNamespace(at=at, linear=np.full(4, np.nan)))
     assert starts["is_best"].data.tolist() == [False, True, False, True]
 
 

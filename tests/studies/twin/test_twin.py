@@ -19,12 +19,13 @@ from jaxmodel.piezo import actuator_constant, sensor_constant
 from jaxmodel.static import static_bending
 from jaxmodel.stretch import find_stretch
 from studies.bench.works import BARE
+from studies.documents import schema
 from studies.engine.design import Design
 from studies.engine.preflight import check_run
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.reference.tables import frequencies
-from studies.show.document import json_text, schema
+from studies.results.document import json_text
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study
 from studies.twin import compare, margin, plan, report
@@ -491,7 +492,9 @@ def test_each_change_has_the_differences_without_and_with_control(monkeypatch, s
     stiffened = [] if stretch else ["twin: links 1000 times stiffer in tension"]
     assert [x.text for x in found if "tension" in x.text] == stiffened
     assert len(found) == 3 + len(stiffened)
-    np.testing.assert_allclose([x[1:] for x in found], [[0.5, 0.8, 0.8]] * len(found))
+    np.testing.assert_allclose(
+        [(x.free, x.controlled, x.voltage) for x in found], [[0.5, 0.8, 0.8]] * len(found)
+    )
 
 
 def test_the_command_writes_report_figure_and_numbers(tmp_path, capsys, monkeypatch):
@@ -501,10 +504,10 @@ def test_the_command_writes_report_figure_and_numbers(tmp_path, capsys, monkeypa
     result = twin_design(design, tmp_path, settings=settings, has_changes=False)
     document = json.loads((tmp_path / "twin.json").read_text())
     jsonschema.validate(document, schema("twin"))
-    assert document == json.loads(json_text("twin", report.document(result)))
-    assert document["gain_margin"]["is_confirmed"]
-    assert document["gain_margin"]["theirs"] == pytest.approx(3.70, rel=0.01)
-    ours, theirs = (document["damping_ratio"][name] for name in ("ours", "theirs"))
+    assert document == json.loads(json_text(report.twin_document(result)))
+    assert document["growth"]["is_confirmed"]
+    assert document["growth"]["margin"] == pytest.approx(3.70, rel=0.01)
+    ours, theirs = (document[name] for name in ("damping_ratio", "twin_damping_ratio"))
     np.testing.assert_allclose(theirs, ours, rtol=0.02)
     page = (tmp_path / "report.html").read_text()
     assert "mid-span deflection, link 1, with control" in page and "data:image/png" in page

@@ -17,8 +17,8 @@ from rich.console import Console
 
 from jaxmodel.shaper import SHAPERS, Impulses
 from studies import passport
+from studies.documents import schema
 from studies.reference import tables
-from studies.show.document import schema
 from studies.study import spec
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import load_study
@@ -542,7 +542,9 @@ def test_the_command(checks, capsys, tmp_path):
     code, out, _ = call(capsys, "verify", tmp_path / "heavy.toml", "--json")
     document = json.loads(out)
     jsonschema.validate(document, schema("verify"))
-    assert code == 1 and document["failed"] == ["x"] and document["passed"] == 1
+    assert (
+        code == 1 and document["summary"]["failed"] == ["x"] and document["summary"]["passed"] == 1
+    )
     assert "failed: x" in passport.find(heavy).text
     assert passport.find(spec.paper_study()).failed == ()
     # whatever its title
@@ -552,7 +554,7 @@ def test_the_command(checks, capsys, tmp_path):
 @pytest.mark.parametrize(("width", "columns"), [(60, 4), (80, 5), (120, 6)])
 def test_the_table_fits_the_terminal(checks, capsys, width, columns):
     word = "pinned_pinned"
-    checks["one"] = lambda _: [row(1e-4)._replace(assumption=f"links ({word})", against=word)]
+    checks["one"] = lambda _: [row(1e-4).replace(assumption=f"links ({word})", against=word)]
     console = Console(width=width)
     commands._print(run.verify_study(), console)
     table, text = capsys.readouterr().out.split("└")

@@ -1,0 +1,48 @@
+"""The schema of every JSON document, by the command that prints or writes it."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from studies.errors import field_error, nearest
+
+#: Where results with a document are declared.
+DOCUMENTS = {
+    "bench": "bench.run.Benchmark",
+    "best": "sweeps.documents.BestCases",
+    "cache": "cache.CacheContents",
+    "commission": "commission.findings.CommissionFindings",
+    "comparison": "export.comparison.ComparedVariants",
+    "fit": "fitting.document.FitDocument",
+    "info": "config.CurrentSettings",
+    "laws": "laws.document.LawsDocument",
+    "modes": "engine.modes.NamedModes",
+    "paper": "papers.card.PaperOutcome",
+    "sensitivity": "sweeps.documents.Sensitivity",
+    "show": "sweeps.documents.Overview",
+    "simulate": "single.documents.RunDocument",
+    "spillover": "spillover.certificate.Certificate",
+    "sweep": "sweeps.dry_run.PlanDocument",
+    "twin": "twin.report.TwinDocument",
+    "verify": "verify.run.ModelVerification",
+}
+
+
+def schema(command: str) -> dict[str, Any]:
+    """JSON schema (2020-12) of the document that a command prints with --json, or writes.
+
+    Args:
+        command: such as "best"; "sweep" is the plan of `studies sweep --dry-run --json`,
+            "spillover" and "fit" are `certificate.json` and `fit.json`.
+
+    Raises:
+        StudyError: a command without one.
+    """
+    from studies.results.schema import schema_of
+
+    if command not in DOCUMENTS:
+        hint = nearest(str(command), list(DOCUMENTS))
+        raise field_error("command", command, ", ".join(DOCUMENTS), hint=hint)
+    module, _, name = DOCUMENTS[command].rpartition(".")
+    return schema_of(getattr(import_module(f"studies.{module}"), name))
