@@ -9,7 +9,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from studies.results.labelled import Derived, Label, Labelled, labels
+from studies.results.labelled import Label, Labelled, labels
 
 #: Types that JSON has; numbers that are not finite are null.
 _SIMPLE: dict[Any, Any] = {
@@ -67,10 +67,8 @@ def _closed(properties: dict[str, Any]) -> dict[str, Any]:
 
 def _annotation(kind: type[Labelled], name: str) -> Any:
     """Type of a field, or of what a property returns."""
-    found = vars(kind).get(name)
-    if isinstance(found, Derived):
-        return get_type_hints(found.fget)["return"]
-    return get_type_hints(kind)[name]
+    compute = getattr(vars(kind).get(name), "fget", None)
+    return get_type_hints(compute)["return"] if compute else get_type_hints(kind)[name]
 
 
 def _labelled(annotation: Any, label: Label, depth: int) -> dict[str, Any]:

@@ -217,8 +217,7 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
         text = page(
             "screen/report.html",
             staging,
-            {"Sweep file": toml_text(screen.spec.data)},
-            about=screen.spec.study,
+            {"Sweep file": toml_text(screen.spec.data), "Study of all designs": screen.spec.study},
             title=screen.spec.study.title,
             command=f"studies {options()}",
             path=quote(str(folder / BEST)),

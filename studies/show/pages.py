@@ -29,7 +29,7 @@ from studies.study.entries import links_text
 from studies.study.labels import describe
 from studies.study.margin import GUESSED, margin_in_db, robustness_text
 from studies.study.spec import Study
-from studies.study.template import study_template
+from studies.study.template import study_template, toml_text
 
 _ROOT = Path(__file__).parents[1]
 #: Where a name in a table may go on in the next line.
@@ -126,9 +126,8 @@ def render(name: str, /, **values: Any) -> str:
 def page(
     name: str,
     folder: Path | None,
-    appended: Study | Mapping[str, str],
+    appended: Study | Mapping[str, Study | str],
     /,
-    about: Study | None = None,
     **values: Any,
 ) -> str:
     """A report as a self-contained web page.
@@ -136,8 +135,8 @@ def page(
     Args:
         name: of its template.
         folder: with its figures, PNG or GIF; None: a page without images.
-        appended: texts to append, by title; or the study reported on, for its file.
-        about: the study whose verification counts; default: the appended one.
+        appended: studies and texts to append, by title; or the study reported on. The first study
+            is that whose verification counts.
         values: of the template.
 
     Returns:
@@ -152,23 +151,32 @@ def page(
         titles.append(title)
         return Markup('<h2 id="{}">{}</h2>').format(_anchor(title), title)
 
+    files = {"Study file": appended} if isinstance(appended, Study) else appended
+    about = next((x for x in files.values() if isinstance(x, Study)), None)
     return render(
         name,
         **values,
         section=section,
         titles=titles,
         image=lambda file, caption: _image(folder, file, caption),
-        facts=config.origin() | _verified(appended if isinstance(appended, Study) else about),
-        files={"Study file": study_template(appended)} if isinstance(appended, Study) else appended,
+        facts=config.origin() | _verified(about),
+        files={title: _file(content) for title, content in files.items()},
     )
+
+
+def _file(content: Study | str) -> tuple[str, str]:
+    """What a page shows of a file, and the rest, which it folds."""
+    if isinstance(content, str):
+        return content, ""
+    own = content.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
+    return toml_text(own) or "# Every field has its default.\n", study_template(content)
 
 
 def _verified(study: Study | None) -> dict[str, str]:
     """What `studies verify` found about the study of a report under the present code."""
-    if study is None:
-        return {}
     found = passport.find(study)
-    return {"verified": found.text if found else "not with this code: `studies verify STUDY`"}
+    text = found.text if found else "not with this code: `studies verify STUDY`"
+    return {} if study is None else {"verified": text}
 
 
 def _image(folder: Path | None, file: str, caption: str) -> Markup:

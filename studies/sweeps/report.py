@@ -31,7 +31,7 @@ from studies.space.methods import METHODS
 from studies.space.spec import Block
 from studies.space.table import case_study
 from studies.study.spec import Study
-from studies.study.template import study_template, toml_text, toml_value
+from studies.study.template import toml_text, toml_value
 from studies.sweeps.dry_run import axis_rows
 from studies.sweeps.plots import front, plot, save_plot
 from studies.sweeps.records import MARGIN
@@ -136,8 +136,7 @@ def report(
     return page(
         "sweeps/report.html",
         images,
-        {"Sweep file": toml_text(spec.data), "Study of all cases": study_template(spec.study)},
-        about=spec.study,
+        {"Sweep file": toml_text(spec.data), "Study of all cases": spec.study},
         title=spec.study.title,
         folder=folder,
         first=direction(metric),

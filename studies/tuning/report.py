@@ -20,7 +20,7 @@ from studies.show.sketch import CAPTION
 from studies.show.units import headed, is_cut_off, number, readable, settling_text
 from studies.study.entries import parse_entries
 from studies.study.margin import caution, margin_in_db, margin_text
-from studies.study.template import study_template, toml_text
+from studies.study.template import toml_text
 from studies.tuning.audit import ALLOWED, MEANING, Disagreement
 from studies.tuning.check import JudgedDesign, RandomSearch, patch_centers
 from studies.tuning.free import PLACEMENT
@@ -84,8 +84,7 @@ def report(
     return page(
         "tuning/report.html",
         images,
-        {"Tuning file": toml_text(spec.data), "Study file": study_template(spec.study)},
-        about=spec.study,
+        {"Tuning file": toml_text(spec.data), "Study file": spec.study},
         spec=spec,
         tune=spec.tune,
         findings=findings,
