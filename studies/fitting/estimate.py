@@ -209,5 +209,19 @@ def _fault(study: Study) -> str:
     return ""
 
 
+def is_good(fitted: Fitted) -> bool:
+    """Whether the model explains the data, and they identify all parameters."""
+    answer = fitted.answer
+    is_tested = answer.freedom > 0 and not answer.is_too_close
+    is_inside = not any(is_at_bound(u) for u in fitted.solution.best.u)
+    is_found = fitted.solution.best.is_converged and is_inside
+    is_identified = not answer.undetermined and not fitted.rivals
+    return bool(answer.is_explained and is_tested and is_found and is_identified)
+
+
+def is_at_bound(place: float) -> bool:
+    return not 1e-6 < place < 1 - 1e-6
+
+
 def named_values(spec: FitSpec, values: np.ndarray) -> dict[str, float]:
     return {x.name: float(v) for x, v in zip(spec.free.numbers, values, strict=True)}

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
 from studies.errors import printable
+from studies.fitting.estimate import Fitted, is_at_bound, is_good
 from studies.fitting.kinds.contract import Line, Numbers
 from studies.fitting.plots import MOST
 from studies.fitting.spec import number_unit
 from studies.fitting.statistics import REGION, UNKNOWN, Answer, Direction, Misfit, region_rise
 from studies.show.pages import page
-
-if TYPE_CHECKING:
-    from studies.fitting.estimate import Fitted
 
 #: Experiments in the report.
 SHOWN = 5
@@ -89,10 +87,6 @@ def _unit(name: str) -> str:
     return "" if unit == "1" else unit
 
 
-def _is_at_bound(place: float) -> bool:
-    return not 1e-6 < place < 1 - 1e-6
-
-
 def value_rows(fitted: Fitted) -> list[list[str]]:
     """Name, value, standard deviation, unit, 95 % interval, and where the value came to lie."""
     rows = []
@@ -105,7 +99,7 @@ def value_rows(fitted: Fitted) -> list[list[str]]:
             [fitted.spec.free.numbers[k].span.low, fitted.spec.free.numbers[k].span.high]
         )
         at = "interval ends at a bound" if np.isclose([low, high], ends, rtol=1e-9).any() else ""
-        at = "at its bound" if _is_at_bound(u[k]) else at
+        at = "at its bound" if is_at_bound(u[k]) else at
         if fitted.answer.sigma[k] >= 0.99 * UNKNOWN * abs(fitted.spec.free.slopes(u)[k]):
             at = "not identifiable"
         rows.append(
@@ -216,23 +210,13 @@ def _unexplained(answer: Answer) -> list[str]:
     ]
 
 
-def is_good(fitted: Fitted) -> bool:
-    """Whether the model explains the data, and they identify all parameters."""
-    answer = fitted.answer
-    is_tested = answer.freedom > 0 and not answer.is_too_close
-    is_inside = not any(_is_at_bound(u) for u in fitted.solution.best.u)
-    is_found = fitted.solution.best.is_converged and is_inside
-    is_identified = not answer.undetermined and not fitted.rivals
-    return bool(answer.is_explained and is_tested and is_found and is_identified)
-
-
 def _at_bounds(fitted: Fitted) -> list[str]:
     """Numbers that would go further if they could."""
     lines = []
     for name, u, number in zip(
         fitted.names, fitted.solution.best.u, fitted.spec.free.numbers, strict=True
     ):
-        if not _is_at_bound(u):
+        if not is_at_bound(u):
             continue
         side, end = ("lower", number.span.low) if u < 0.5 else ("upper", number.span.high)
         value = f"{end:g} {_unit(name)}".rstrip()

@@ -8,8 +8,9 @@ from matplotlib.ticker import MaxNLocator
 
 from jaxmodel.metrics import METRICS
 from studies.show import figures
+from studies.tuning.findings import TuneFindings
 from studies.tuning.optimise import excess
-from studies.tuning.report import TuneFindings, is_kept
+from studies.tuning.report import is_kept
 from studies.tuning.scenarios import move_label
 from studies.tuning.spec import TuneSpec
 

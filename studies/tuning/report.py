@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -14,15 +14,15 @@ from jaxmodel.loop_figures import MARGIN_MODES, MARGINS, PEAKS
 from jaxmodel.metrics import METRICS
 from studies.engine.fidelity import rank_correlation
 from studies.engine.poles import HEADER, difference, pole_rows
-from studies.publish import shown
 from studies.show.pages import page
 from studies.show.sketch import CAPTION
 from studies.show.units import headed, is_cut_off, number, readable, settling_text
 from studies.study.entries import parse_entries
 from studies.study.margin import caution, margin_in_db, margin_text
 from studies.study.template import toml_text
-from studies.tuning.audit import ALLOWED, MEANING, Disagreement
+from studies.tuning.audit import ALLOWED, MEANING
 from studies.tuning.check import JudgedDesign, RandomSearch, patch_centers
+from studies.tuning.findings import TuneFindings, best_family
 from studies.tuning.free import PLACEMENT
 from studies.tuning.loop_figures import (
     LOOP_UNITS,
@@ -34,7 +34,7 @@ from studies.tuning.loop_figures import (
 )
 from studies.tuning.objective import SHOWN
 from studies.tuning.optimise import GAIN, KEPT, PATIENCE, Progress, excess
-from studies.tuning.references import References, reference_lines, resolution_lines
+from studies.tuning.references import reference_lines, resolution_lines
 from studies.tuning.scenarios import fresh_machines, move_label
 from studies.tuning.spec import LOOP_LIMITS, LOWER, Family, TuneSpec, label
 
@@ -46,25 +46,6 @@ ALIKE = 0.01
 FEW, NARROW = 8, 0.05
 #: Heading of the reference row.
 REFERENCE = "baseline"
-
-
-class TuneFindings(NamedTuple):
-    """Everything that a tuning found."""
-
-    spec: TuneSpec
-    at: Progress
-    baseline: JudgedDesign  # the baseline
-    judged: list[JudgedDesign]  # the best design of every family, in the order of `spec.families`
-    audited: list[Disagreement]  # at the best design of the family with most parameters
-    linear: np.ndarray  # linear residual vibration of each start's best design [m], (B,)
-    residual: np.ndarray  # of its own run on the first scenario [m], (B,); nan if not judged by it
-    searched: RandomSearch | None
-    run_time: float  # of a differentiated run [s]
-    runs: int  # how many there were
-    references: References = References(None, None, None, None)  # what designs have to beat
-
-    def _repr_html_(self) -> str:
-        return shown(self)
 
 
 def report(
@@ -189,13 +170,8 @@ def _gain(figure: str, change: str, after: str, before: str, is_worse: bool) -> 
         before: of the baseline.
         is_worse: by more than `ALIKE`.
     """
-    return {
-        "figure": figure,
-        "change": change,
-        "after": after,
-        "before": before,
-        "is_worse": is_worse,
-    }
+    names = "figure", "change", "after", "before", "is_worse"
+    return dict(zip(names, (figure, change, after, before, is_worse), strict=True))
 
 
 def _loop_gains(
@@ -211,15 +187,8 @@ def _loop_gains(
         larger = after / before if before else np.nan
         is_worse = larger < 1 - ALIKE if name in LOWER else larger > 1 + ALIKE
         unit = "" if unit_text(name) == "1" else f" {unit_text(name)}"
-        gains.append(
-            _gain(
-                name.replace("_", " "),
-                _percent_change(before, after),
-                f"{after:.3g}",
-                f"{before:.3g}{unit}",
-                is_worse,
-            )
-        )
+        figure, change = name.replace("_", " "), _percent_change(before, after)
+        gains.append(_gain(figure, change, f"{after:.3g}", f"{before:.3g}{unit}", is_worse))
     return gains
 
 
@@ -240,18 +209,6 @@ def _loop_head(name: str) -> str:
 def _percent_change(before: float, after: float) -> str:
     """A relative change in percent, "" if there is nothing to relate to."""
     return f"{100 * (after / before - 1):+.3g} %" if before else ""
-
-
-def best_family(spec: TuneSpec, findings: TuneFindings) -> int:
-    """Index of the family to recommend: limits kept first, then the least objective."""
-
-    def rank(k: int) -> tuple[bool, bool, float]:
-        is_moving = k < len(spec.moving)
-        beyond = findings.at.beyond(findings.at.winner(k)) if is_moving else 0.0
-        value = findings.judged[k].objective.mean()
-        return beyond > 0, not np.isfinite(value), value
-
-    return min(range(len(spec.moving)), key=rank)
 
 
 def file_name(spec: TuneSpec, family: Family) -> str:
@@ -497,27 +454,3 @@ def _codes(judged: JudgedDesign) -> str:
     codes, counts = np.unique(judged.status, return_counts=True)
     pairs = zip(codes, counts, strict=True)
     return ", ".join(f"{count} {status.REASONS[int(code)]}" for code, count in pairs)
-
-
-def violated_limits(spec: TuneSpec, at: Progress) -> list[str]:
-    """Limits that no start of a family keeps, one line per family; empty if all are kept."""
-    lines = []
-    for k, family in enumerate(spec.moving):
-        if at.beyond(at.winner(k)) == 0:
-            continue
-        lines.append(f"{family.name}: {_contradiction(spec, family, at.least[k])}")
-    return lines
-
-
-def _contradiction(spec: TuneSpec, family: Family, values: np.ndarray) -> str:
-    least = dict(zip(spec.limit_names, values, strict=True))
-    never = [name for name, value in least.items() if value > KEPT]
-    if never:
-        return ", ".join(
-            f"{name} = {family.limits[name]} is satisfied by no design"
-            + ("" if name in LOOP_LIMITS else f" (nearest {100 * least[name]:+.1f} %)")
-            for name in never
-        )
-    return " and ".join(f"{name} = {family.limits[name]}" for name in spec.limit_names) + (
-        " are satisfied by some design each, but by none together"
-    )

@@ -11,9 +11,9 @@ from studies.study.entries import links_text, parse_entries
 from studies.study.labels import STATUS_LABEL
 from studies.study.paths import field_unit, parse_entry
 from studies.tuning.check import JudgedDesign, fresh_columns, patch_centers
+from studies.tuning.findings import TuneFindings
 from studies.tuning.loop_figures import LOOP_UNITS
 from studies.tuning.references import ALONE, WITHOUT
-from studies.tuning.report import TuneFindings
 from studies.tuning.scenarios import loop_machines
 from studies.tuning.spec import TuneSpec
 

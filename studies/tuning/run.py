@@ -33,18 +33,16 @@ from studies.tuning import plots
 from studies.tuning.audit import Disagreement, audit
 from studies.tuning.check import RandomSearch, search, tuned_study
 from studies.tuning.evaluate import Evaluator
+from studies.tuning.findings import TuneFindings, best_family, violated_limits
 from studies.tuning.folder import PROGRESS, RESULTS, open_tuning, save_progress, write_designs
 from studies.tuning.optimise import Progress, is_compatible, optimise, start_families
 from studies.tuning.phases import KeptPhases
 from studies.tuning.references import compare
 from studies.tuning.report import (
-    TuneFindings,
-    best_family,
     ended,
     file_name,
     report,
     summary,
-    violated_limits,
 )
 from studies.tuning.results import variables
 from studies.tuning.spec import TuneSpec

@@ -15,10 +15,10 @@ from studies.documents import schema
 from studies.errors import StudyError
 from studies.fitting import run
 from studies.fitting.bench import Modes
-from studies.fitting.estimate import estimate
+from studies.fitting.estimate import estimate, is_good
 from studies.fitting.experiment import next_experiments
 from studies.fitting.kinds.modes import Measured, pair_modes
-from studies.fitting.report import describe_direction, is_good, sentences, summary
+from studies.fitting.report import describe_direction, sentences, summary
 from studies.fitting.run import run_fit
 from studies.fitting.solve import SAME, Solution, exchanges
 from studies.fitting.spec import load_fit

@@ -17,10 +17,11 @@ from studies.spillover.report import residual_text
 from studies.study.margin import margin_in_db
 from studies.tuning.audit import Disagreement
 from studies.tuning.check import JudgedDesign, OwnRun, patch_centers
+from studies.tuning.findings import TuneFindings
 from studies.tuning.loop_figures import DesignFigures
 from studies.tuning.optimise import begin
-from studies.tuning.report import TuneFindings, summary
 from studies.tuning.report import report as tuning_report
+from studies.tuning.report import summary
 from studies.tuning.spec import parse_tuning
 from tests.bare import paper_study
 from tests.pages import tables_of, text_of

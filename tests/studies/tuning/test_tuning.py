@@ -20,6 +20,7 @@ from studies.study.cases import build_structure
 from studies.tuning import linear_fidelity, loop_figures, loop_programs
 from studies.tuning.check import tuned_study
 from studies.tuning.evaluate import Evaluation
+from studies.tuning.findings import violated_limits
 from studies.tuning.folder import load_progress, save_progress
 from studies.tuning.linear_fidelity import BATCH, LinearFidelity
 from studies.tuning.loop_figures import machine_figures
@@ -33,7 +34,6 @@ from studies.tuning.optimise import (
     optimise,
     start_families,
 )
-from studies.tuning.report import violated_limits
 from studies.tuning.run import make_evaluator
 from studies.tuning.scenarios import scenario_columns, tuned_machines
 from studies.tuning.spec import Family, Tune, TuneSpec

@@ -29,11 +29,12 @@ from studies.tuning import run as tuning_run
 from studies.tuning.audit import Disagreement
 from studies.tuning.check import JudgedDesign, OwnRun
 from studies.tuning.evaluate import Evaluation, Evaluator
+from studies.tuning.findings import TuneFindings, best_family
 from studies.tuning.folder import open_tuning
 from studies.tuning.loop_figures import DesignFigures
 from studies.tuning.objective import objective_of
 from studies.tuning.optimise import begin, is_compatible
-from studies.tuning.report import TuneFindings, best_family, n_outside, rank_correlation, report
+from studies.tuning.report import n_outside, rank_correlation, report
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import load_tuning
 from tests.bare import paper_study, parse_tuning
