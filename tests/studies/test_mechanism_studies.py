@@ -146,7 +146,7 @@ def test_a_pose_has_as_many_numbers_as_the_platform(capsys):
     lowest = []
     for pose in ("0,0.25", "0.02,0.24"):
         main(["modes", "five_bar", "--pose", pose, "--json"])
-        lowest.append(json.loads(capsys.readouterr().out)["modes"][0]["frequency_hz"])
+        lowest.append(json.loads(capsys.readouterr().out)["modes"][0]["frequency"])
     assert lowest[0] != pytest.approx(lowest[1], rel=1e-3)
     with pytest.raises(SystemExit):
         main(["modes", "five_bar", "--pose", "0,0.25,0"])

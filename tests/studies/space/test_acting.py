@@ -12,7 +12,7 @@ from studies.space import table as tables
 from studies.space.table import build_table, designs
 from studies.study.fields import _LAWS, _RULES, idle_axes
 from studies.study.spec import Study
-from studies.sweeps.dry_run import axes_of
+from studies.sweeps.dry_run import Estimate, axes_of
 from studies.sweeps.run import run_sweep
 from tests.canonical import MACHINE
 from tests.studies.test_cli import run
@@ -160,7 +160,7 @@ def test_axes_that_nothing_depends_on_are_named():
 
 
 def test_dry_run_tells_them_and_each_axis_once(tmp_path, capsys, monkeypatch):
-    nothing = dict.fromkeys(("seconds", "compile_seconds", "bytes", "measured_cases"), 0.0)
+    nothing = Estimate(0.0, 0.0, 0.0, 0)
     monkeypatch.setattr("studies.sweeps.dry_run.estimate", lambda plan: nothing)
     path = tmp_path / "sweep.toml"
     path.write_text("""
