@@ -36,14 +36,10 @@ Scheduler = Annotated[
 ]
 
 
-LocalWorkers = Annotated[
-    int | None, typer.Option(help="run in this many processes on this machine")
-]
+LocalWorkers = Annotated[int | None, typer.Option(help="run in this many processes here")]
 
 
-WorkerTimeout = Annotated[
-    float, typer.Option(help="restart a worker that does not answer for this long [s]")
-]
+WorkerTimeout = Annotated[float, typer.Option(help="restart workers silent for so long [s]")]
 
 
 #: Default of `WorkerTimeout` [s].
@@ -92,8 +88,8 @@ class Workers(NamedTuple):
 
 
 #: Workers as users name them: a number of processes on this machine, a scheduler's address or file;
-#: None: all cores where that is worth their start.
-Place = Workers | int | str | None
+#: None: all cores where that is worth their start, otherwise this process.
+Place = Workers | int | str | Path | None
 
 
 @contextmanager
@@ -111,8 +107,12 @@ def on_workers(
     Raises:
         StudyError: as `connected`.
     """
-    if not isinstance(place, Workers):
-        place = Workers(scheduler=place) if isinstance(place, str) else Workers(local=place)
+    if isinstance(place, str | Path):
+        place = Workers(scheduler=str(place))
+    elif place is None or type(place) is int:
+        place = Workers(local=place)
+    elif not isinstance(place, Workers):
+        raise field_error("workers", place, "a number of processes, a scheduler's address or file")
     workers = place.with_default(is_large, say)
     if not workers.are_named:
         yield None

@@ -26,9 +26,7 @@ class CommissionFindings(Labelled, command="commission"):
     tuned: Study | None = unwritten(default=None)
     is_fast: bool = unwritten(default=False)  # whether it was tuned on a faster motion than its own
     price: str = unwritten(default="")  # of gains that were lowered after the tuning
-    margins: np.ndarray | None = unwritten(
-        default=None
-    )  # on machines that the data leave possible, (n,)
+    margins: np.ndarray | None = unwritten(default=None)  # on machines left possible, (n,)
     certificate: dict[str, Any] | None = unwritten(default=None)  # its document
 
     @derived("", "whether there is firmware that can be used")

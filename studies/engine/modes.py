@@ -63,14 +63,11 @@ class NamedModes(Labelled, command="modes", version=2):
 
     frequency: np.ndarray = unwritten()  # |lambda|/2 pi, ascending [Hz], (m,)
     damping_ratio: np.ndarray = unwritten()  # [1], (m,)
-    shape: np.ndarray = (
-        unwritten()
-    )  # (X, q) part of the eigenvectors, largest entry 1, (n, m), one per column
-    link_share: np.ndarray = unwritten()  # [1], (m, 3, R), or (m, 3, R + 1) with elongations last
+    # (X, q) part of the eigenvectors, largest entry 1, one per column, (n, m)
+    shape: np.ndarray = unwritten()
+    link_share: np.ndarray = unwritten()  # [1], (m, links, R), elongations last if any
     drive_share: np.ndarray = unwritten()  # [1], (m,)
-    turn_share: np.ndarray = (
-        unwritten()
-    )  # of the platform's kinetic energy that is in rotation [1], (m,)
+    turn_share: np.ndarray = unwritten()  # of rotation in the platform's kinetic energy [1], (m,)
     has_stretch: bool = unwritten(default=False)  # links lengthen
 
     def _repr_html_(self) -> str:

@@ -139,7 +139,7 @@ class Records(NamedTuple):
     frozen_default=True, eq_default=False, field_specifiers=(labelled, told, unwritten)
 )
 class Labelled:
-    """Base of all results; a subclass is a frozen dataclass whose fields all have labels.
+    """Base of all results, which are frozen dataclasses whose fields all have labels.
 
     command: whose document it is, "" for parts of others; version: of the document's format.
     """

@@ -67,7 +67,7 @@ def _closed(properties: dict[str, Any]) -> dict[str, Any]:
 
 def _annotation(kind: type[Labelled], name: str) -> Any:
     """Type of a field, or of what a property returns."""
-    compute = getattr(vars(kind).get(name), "fget", None)
+    compute = getattr(getattr(kind, name, None), "fget", None)
     return get_type_hints(compute)["return"] if compute else get_type_hints(kind)[name]
 
 

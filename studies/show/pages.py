@@ -29,7 +29,7 @@ from studies.study.entries import links_text
 from studies.study.labels import describe
 from studies.study.margin import GUESSED, margin_in_db, robustness_text
 from studies.study.spec import Study
-from studies.study.template import study_template, toml_text
+from studies.study.template import own_text, study_template
 
 _ROOT = Path(__file__).parents[1]
 #: Where a name in a table may go on in the next line.
@@ -168,8 +168,7 @@ def _file(content: Study | str) -> tuple[str, str]:
     """What a page shows of a file, and the rest, which it folds."""
     if isinstance(content, str):
         return content, ""
-    own = content.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
-    return toml_text(own) or "# Every field has its default.\n", study_template(content)
+    return own_text(content) or "# Every field has its default.\n", study_template(content)
 
 
 def _verified(study: Study | None) -> dict[str, str]:

@@ -59,7 +59,7 @@ class Certificate(Labelled, command="spillover", version=4):
     plant that it was judged on.
 
     Axes: B bases, D mismatches, N numbers of modes. Numbers of plants that do not exist (patches
-    overlap, ...) are NaN, their texts "".
+    overlap, ...) and of modes beyond a plant's own are NaN, null in JSON; their texts "".
     """
 
     ROWS = Records("plants", _PLANTS, "every plant that it was judged on", "exists")
@@ -71,7 +71,7 @@ class Certificate(Labelled, command="spillover", version=4):
     exists: np.ndarray = unwritten()  # (B, D, N)
     spectral_radius: np.ndarray = labelled("1", "of the loop at its own gains", *_PLANTS)
     gain_margin: np.ndarray = labelled("1", "common gain factor before instability", *_PLANTS)
-    frequency: np.ndarray = labelled("Hz", "of link modes, three of each order", *_MODES)
+    frequency: np.ndarray = labelled("Hz", "of modes under control, by order and link", *_MODES)
     damping_ratio: np.ndarray = labelled("1", "their damping ratios", *_MODES)
     free_damping_ratio: np.ndarray = labelled("1", "without control", *_MODES)
     least_damped: Texts = labelled("1", "mode of least damping", *_PLANTS)

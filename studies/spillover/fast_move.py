@@ -28,7 +28,7 @@ class ControlEffect(Labelled):
         "1", "of the links, in the fast move", "control", default=("on", "off")
     )
 
-    @derived("", "[s]; null: from the initial state, without a move")
+    @derived("", "of the fast move [s]; null: from the initial state, without a move")
     def move_time(self) -> float | None:
         motion = self.study.motion
         assert isinstance(motion.move_time, float)

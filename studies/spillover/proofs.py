@@ -68,7 +68,7 @@ class ProvenBox(Labelled):
     cells: int = told("of frequency and box that were evaluated")
     seconds: float = unwritten()
     unstable: tuple[float, float, float] | None = told(
-        "an unstable machine, by eigenvalues; null: none found", default=None
+        "an unstable machine, as `ranges`; null: none found", default=None
     )
     fault: str = told("why nothing is known", default="")
 

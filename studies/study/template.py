@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from studies.errors import StudyError
 from studies.publish import check_target, replacing
 from studies.study.explain import allowed_values, choices_of, unit_of
-from studies.study.spec import Study
+from studies.study.spec import Study, parse_study
 
 #: What an engineer changes first: all that `studies init` writes.
 STARTERS = (
@@ -80,6 +80,21 @@ def study_template(study: Study | None = None) -> str:
             for field in type(section).model_fields:
                 lines += _field(section, field)
     return "\n".join(lines) + "\n"
+
+
+def own_text(study: Study) -> str:
+    """What of a study differs from its mechanism's defaults, as a file that reads back as it."""
+    base = parse_study({"machine": {"kind": study.machine.kind}}).model_dump(mode="json")
+    base["machine"]["kind"] = Study().machine.kind
+    return toml_text(_beyond(study.model_dump(mode="json", exclude_none=True), base))
+
+
+def _beyond(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        name: _beyond(x, base[name]) if isinstance(x, Mapping) and name in base else x
+        for name, x in data.items()
+        if x != base.get(name)
+    }
 
 
 def write_study(out: str | Path, study: Study | None = None) -> None:

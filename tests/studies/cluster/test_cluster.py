@@ -8,6 +8,7 @@ import threading
 import time
 from contextlib import ExitStack, contextmanager
 from itertools import islice
+from pathlib import Path
 from types import SimpleNamespace
 
 import dask
@@ -301,6 +302,7 @@ def test_much_work_uses_many_cores_without_being_asked(monkeypatch, cores, is_la
         (None, Workers()),
         (2, Workers(local=2)),
         ("tcp://127.0.0.1:1", Workers("tcp://127.0.0.1:1")),
+        (Path("cluster.json"), Workers("cluster.json")),
         (Workers(local=1, timeout=9.0), Workers(local=1, timeout=9.0)),
     ],
 )
@@ -316,6 +318,15 @@ def test_workers_are_named_in_python_too(monkeypatch, place, named):
     with on_workers(place, False, print, lambda client, timeout: (client, timeout)) as found:
         assert found == (("client", named.timeout) if named.are_named else None)
     assert asked == [named] * named.are_named
+
+
+@pytest.mark.parametrize("place", [2.0, True, [2]])
+def test_what_names_no_workers_is_refused(place):
+    with (
+        pytest.raises(StudyError, match="workers = .*; allowed: a number of processes"),
+        on_workers(place, False, print, lambda client, timeout: None),
+    ):
+        pass
 
 
 @pytest.mark.parametrize(

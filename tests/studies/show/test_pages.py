@@ -18,7 +18,8 @@ from studies.show import pages
 from studies.show.figures import SMALL, WIDTH, is_wide, new_figure, styled
 from studies.show.pages import page, render
 from studies.study import spec as spec_module
-from studies.study.template import toml_text
+from studies.study.spec import Study, parse_study
+from studies.study.template import own_text, toml_text
 from tests.pages import (
     READABLE,
     TITLE,
@@ -242,3 +243,20 @@ def test_a_browser_finds_faults(tmp_path):
     bad = '<img src="data:image/png;base64,AAAA"><p style="width: 3000px">wide</p>'
     images, broken, over, _ = rendered(HEAD + bad + "</body></html>", tmp_path, 1280)
     assert (images, broken) == (1, 1) and over > 1000
+
+
+@pytest.mark.parametrize(
+    "sections",
+    [
+        {},
+        {"machine": {"kind": "five_bar"}},
+        # equal to the defaults of the default mechanism, not to those of its own
+        {"machine": {"kind": "rrr"}, "motion": {"waypoints": Study().motion.waypoints}},
+        {"title": 'a "b"', "link": {"length": [0.2, 0.21, 0.22]}, "drive": {"locked": True}},
+    ],
+)
+def test_what_differs_from_the_defaults_reads_back_as_the_study(sections):
+    study = parse_study(sections)
+    text = own_text(study)
+    assert parse_study(tomllib.loads(text)) == study
+    assert tomllib.loads(text).keys() == sections.keys()
