@@ -478,6 +478,6 @@ def test_it_is_certified_with_its_delay(tmp_path):
         for x in (study, study.change(electronics__delay=1.25))
     )
     assert report.gain_margin < 60
-    np.testing.assert_allclose(found.margin[0, 0, 0], report.gain_margin, rtol=2e-4)
-    np.testing.assert_allclose(found.radius[0, 0, 0], report.spectral_radius, rtol=1e-9)
+    np.testing.assert_allclose(found.gain_margin[0, 0, 0], report.gain_margin, rtol=2e-4)
+    np.testing.assert_allclose(found.spectral_radius[0, 0, 0], report.spectral_radius, rtol=1e-9)
     assert abs(other.gain_margin / report.gain_margin - 1) > 0.02
