@@ -59,9 +59,10 @@ from studies.fitting.tables import column, read_columns
 from studies.kernels import compilation
 from studies.kernels.compilation import ObjectCache, _key
 from studies.passport import Passport
+from studies.results.labelled import Variable
 from studies.space.spec import load_sweep, parse_sweep
 from studies.space.table import build_table
-from studies.store import Variable, write_store
+from studies.store import write_store
 from studies.study.files import READY, read_toml
 from studies.study.spec import Study, load_study
 from studies.sweeps.run import case_content

@@ -22,7 +22,7 @@ import numpy as np
 from studies.errors import StudyError
 from studies.publish import check_target, replacing
 from studies.reading import open_hdf5
-from studies.results.labelled import Variable as Variable
+from studies.results.labelled import Variable
 
 # What the words of flag_meanings may not contain.
 _NO_FLAG = re.compile(r"[^A-Za-z0-9_.+@-]+")

@@ -52,9 +52,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 def _peers(rows: Iterable[Any]) -> Table:
     table = Table("W0 with", "configurations/s", "error [share of the largest rms]", "times slower")
     for row in rows:
-        table.add_row(
-            row.peer, f"{row.configs_per_s:.3g}", f"{row.error:.1e}", f"{row.times_slower:.3g}"
-        )
+        numbers = f"{row.configs_per_s:.3g}", f"{row.error:.1e}", f"{row.times_slower:.3g}"
+        table.add_row(row.peer, *numbers)
     return table
 
 

@@ -31,9 +31,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 #: Options of the commands that can use workers.
-Scheduler = Annotated[
-    str | None, typer.Option(help="run on a Dask cluster: tcp://HOST:PORT or its JSON file")
-]
+Scheduler = Annotated[str | None, typer.Option(help="Dask cluster: tcp://HOST:PORT, or its file")]
 
 
 LocalWorkers = Annotated[int | None, typer.Option(help="run in this many processes here")]
@@ -94,7 +92,11 @@ Place = Workers | int | str | Path | None
 
 @contextmanager
 def on_workers(
-    place: Place, is_large: bool, say: Callable[[str], None], make: Callable[[Client, float], T]
+    place: Place,
+    is_large: bool,
+    say: Callable[[str], None],
+    make: Callable[[Client, float], T],
+    given: T | None = None,
 ) -> Iterator[T | None]:
     """Make something from a client of the workers, None for this process.
 
@@ -103,6 +105,7 @@ def on_workers(
         is_large: the work is worth the start of workers that are not asked for.
         say: called with progress messages.
         make: called with the client and the workers' time limit [s].
+        given: what to use in place of workers.
 
     Raises:
         StudyError: as `connected`.
@@ -113,9 +116,9 @@ def on_workers(
         place = Workers(local=place)
     elif not isinstance(place, Workers):
         raise field_error("workers", place, "a number of processes, a scheduler's address or file")
-    workers = place.with_default(is_large, say)
-    if not workers.are_named:
-        yield None
+    workers = place.with_default(is_large and given is None, say)
+    if given is not None or not workers.are_named:
+        yield given
         return
     with connected(workers, say) as client:
         yield make(client, workers.timeout)

@@ -88,12 +88,10 @@ def chosen_text(outcome: CommissionFindings) -> str:
 def sure_text(outcome: CommissionFindings) -> str:
     """How sure it is that the controller does on the machine what it was designed for."""
     parts = []
-    if outcome.margins is not None:
-        least = margin_text(float(outcome.margins.min()), 3)
-        parts.append(
-            f"gain margin {least} or more on {len(outcome.margins)} machines that the data leave "
-            "possible"
-        )
+    if outcome.gain_margin is not None:
+        least = margin_text(outcome.gain_margin, 3)
+        where = f"on {outcome.machines} machines that the data leave possible"
+        parts.append(f"gain margin {least} or more {where}")
     if outcome.certificate is not None:
         verdict = outcome.certificate["verdict"]
         parts.append(f"certificate, on plants of the same basis further off, {verdict}")

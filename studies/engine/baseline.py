@@ -22,9 +22,10 @@ from studies.engine.run_data import metric_variables, run_attributes
 from studies.engine.runs import run_uncontrolled
 from studies.engine.stored import kept_metrics
 from studies.errors import StudyError
+from studies.results.labelled import Variable
 from studies.space.spec import SweepSpec
 from studies.space.table import CaseTable
-from studies.store import Variable, axis_sizes, write_store
+from studies.store import axis_sizes, write_store
 from studies.study.labels import STATUS_LABEL
 
 

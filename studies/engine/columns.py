@@ -161,9 +161,8 @@ def axis_variables(
         axes.put("station", np.array(study.metrics.stations), "1", STATION_TEXT, "station")
     if "spectrum_point" in sizes:
         ratio = np.linspace(1 - SPECTRUM_SPAN, 1 + SPECTRUM_SPAN, sizes["spectrum_point"])
-        axes.put(
-            "spectrum_point", ratio, "1", "frequency over the modal frequency", "spectrum_point"
-        )
+        text = "frequency over the modal frequency"
+        axes.put("spectrum_point", ratio, "1", text, "spectrum_point")
     return axes
 
 

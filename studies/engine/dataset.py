@@ -12,9 +12,10 @@ import numpy as np
 from studies.engine.columns import PER_CASE
 from studies.engine.results import SweepData, as_sweep, swept_names
 from studies.engine.stored import CODES
+from studies.results.labelled import Variable
 from studies.space.spec import BlockNode
 from studies.space.table import all_columns
-from studies.store import Variable, axis_sizes, variable_labels, with_coordinates
+from studies.store import axis_sizes, variable_labels, with_coordinates
 
 if TYPE_CHECKING:
     import xarray

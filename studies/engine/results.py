@@ -34,11 +34,12 @@ from studies.engine.folder import (
 from studies.engine.stored import gather
 from studies.errors import StudyError, field_error, nearest
 from studies.reading import parse_json
+from studies.results.labelled import Variable
 from studies.space.axes import LABELS, SHOWN_AS
 from studies.space.condition import evaluate
 from studies.space.spec import SweepSpec, parse_sweep
 from studies.space.table import CaseTable, build_table, case_ids, designs
-from studies.store import Variable, axis_sizes, numbers_digest, read_store, with_coordinates
+from studies.store import axis_sizes, numbers_digest, read_store, with_coordinates
 from studies.study.fields import Fields
 from studies.study.paths import NAMED_INDEX, known_field, parse_entry
 

@@ -28,9 +28,10 @@ from studies.engine.columns import (
 )
 from studies.engine.folder import JOINED, Finished
 from studies.errors import field_error, nearest
+from studies.results.labelled import Variable
 from studies.space.spec import SweepSpec
 from studies.space.table import CaseTable
-from studies.store import LazyArray, Variable, axis_sizes, write_store
+from studies.store import LazyArray, axis_sizes, write_store
 
 if TYPE_CHECKING:
     from studies.engine.chunks import Done

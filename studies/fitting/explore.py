@@ -11,9 +11,10 @@ from studies.engine.folder import FIT
 from studies.errors import StudyError
 from studies.explorer.table import Column, ExplorerTable, text_column
 from studies.reading import parse_json
+from studies.results.labelled import Variable
 from studies.show.figures import is_wide
 from studies.show.words import machine_text
-from studies.store import Variable, read_store
+from studies.store import read_store
 from studies.study.spec import parse_study
 
 OPTIMUM, MACHINE = "optimum", "possible machine"

@@ -13,9 +13,8 @@ from typing import NamedTuple
 from matplotlib.figure import Figure
 
 from studies.engine.batches import ProgressCallback
-from studies.results.labelled import Labelled, told
+from studies.results.labelled import Labelled, Variable, told
 from studies.show.listing import Rows
-from studies.store import Variable
 from studies.study.spec import Study
 
 HOLDS, FAILS = "holds", "fails"

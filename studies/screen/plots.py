@@ -7,12 +7,12 @@ from matplotlib.figure import Figure
 
 from jaxmodel.metrics import METRICS
 from studies.engine.results import SweepData
+from studies.results.labelled import Variable
 from studies.screen.run import ScreenOutcome
 from studies.screen.shards import ScreenRequest
 from studies.screen.tally import BUCKETS, GROWTH, LEAST, quantile
 from studies.show import figures
 from studies.show.units import headed, readable
-from studies.store import Variable
 from studies.study.paths import field_unit
 from studies.sweeps.show import unit_of_metric
 

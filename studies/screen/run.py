@@ -77,10 +77,8 @@ def run_screen(
     if phases is None:
         with Phases(Console(highlight=False, markup=False), PHASES, is_quiet) as phases:
             return run_screen(screen, out, False, workers, phases, screener)
-    if screener is not None:
-        return _run_rest(screen, Path(out), screener, phases)
     is_large = screen.n_designs >= LARGE
-    with on_workers(workers, is_large, phases.say, ClusterScreener) as found:
+    with on_workers(workers, is_large, phases.say, ClusterScreener, screener) as found:
         return _run_rest(screen, Path(out), found or LocalScreener(), phases)
 
 

@@ -219,7 +219,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if as_json:
             from studies.sweeps.documents import best_document
 
-            document = best_document(data, by, subject_to, count)
+            document = best_document(data, by, cases, subject_to)
             print_document(document.replace(smallest_changes=changes and list(changes)))
             return
         print_uncontrolled(data, name, console)

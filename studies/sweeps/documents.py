@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, TypeAlias
 
+import numpy as np
+
 from jaxmodel import status
 from studies.engine.results import (
     SweepData,
@@ -84,26 +86,29 @@ class Sensitivity(Labelled, command="sensitivity"):
 def show_document(data: SweepData, is_failed: bool) -> Overview:
     """The overview of a sweep; is_failed: with the failed cases one by one."""
     by = ranking(data)
-    is_there, condition = is_ranked(data, by), requirement(data, by)
+    best = None
+    if is_ranked(data, by):
+        condition = requirement(data, by)
+        best = best_document(data, by, ranked_cases(data, by, condition), condition)
     return Overview(
         title=data.spec.study.title,
         n_cases=data.n_cases,
         axes=swept_names(data),
         statuses=status_records(data),
         causes=failure_causes(data),
-        best=best_document(data, by, condition) if is_there else None,
+        best=best,
         failed=failed_records(data, failed_cases(data)) if is_failed else None,
     )
 
 
-def best_document(data: SweepData, by: str, subject_to: str = "", count: int = 10) -> BestCases:
-    """The best cases of a sweep; arguments and errors as `best_cases`."""
+def best_document(data: SweepData, by: str, cases: np.ndarray, condition: str = "") -> BestCases:
+    """The best cases of a sweep, from `ranked_cases`."""
     name = by.removeprefix("-")
-    cases, metrics = ranked_cases(data, by, subject_to, count), with_others(data, [name])
+    metrics = with_others(data, [name])
     return BestCases(
         by=name,
         direction=direction(by),
-        subject_to=subject_to,
+        subject_to=condition,
         without_control=uncontrolled_value(data, name),
         environments=list(data.spec.sweep.environments),
         over=str(data.spec.sweep.over),

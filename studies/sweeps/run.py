@@ -148,11 +148,9 @@ def run_sweep(
         console = console or Console(highlight=False, markup=False)
         with Phases(console, sweep_phases(spec), is_quiet) as phases:
             return run_sweep(spec, out, is_resumed, None, False, workers, phases, runner)
-    if runner is not None:
-        return _run_rest(spec, Path(out), is_resumed, runner, phases)
     n_cases = design_of(spec.root, spec.study, spec.sweep.seed).size * spec.sweep.repeats
     remote = partial(ClusterRunner, spec)
-    with on_workers(workers, n_cases >= LARGE, phases.say, remote) as found:
+    with on_workers(workers, n_cases >= LARGE, phases.say, remote, runner) as found:
         return _run_rest(spec, Path(out), is_resumed, found or LocalRunner(), phases)
 
 

@@ -12,10 +12,11 @@ from studies.errors import StudyError
 from studies.explorer.replays import MOST_REPLAYS, replayed
 from studies.explorer.table import Column, ExplorerTable, Placement, text_column
 from studies.reading import parse_json, read_json
+from studies.results.labelled import Variable
 from studies.show.figures import is_wide
 from studies.show.units import readable
 from studies.show.words import baseline_text
-from studies.store import Variable, read_store
+from studies.store import read_store
 from studies.study.spec import Study
 from studies.tuning.check import tuned_study
 from studies.tuning.folder import MANIFEST, RESULTS

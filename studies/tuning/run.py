@@ -95,12 +95,12 @@ def run_tuning(
     remote = partial(ClusterEvaluator, spec, phases.say)
     with (
         phases,
-        on_workers(workers, False, phases.say, remote) as found,
+        on_workers(workers, False, phases.say, remote, evaluator) as found,
         open_tuning(out, manifest, is_resumed) as before,
     ):
         if before is not None and not is_compatible(spec, before):
             raise StudyError(f"{out / PROGRESS}: damaged; name a new folder")
-        findings = _tune(spec, out, before, evaluator or found, phases)
+        findings = _tune(spec, out, before, found, phases)
     faults = violated_limits(spec, findings.at)
     if faults:
         raise StudyError("tune.limits: not satisfied together; " + "; ".join(faults))

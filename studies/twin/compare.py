@@ -57,9 +57,9 @@ class BothRuns(NamedTuple):
 class Gap(Labelled):
     """A quantity in the window after the reference trajectory, rms in its unit, entry by entry."""
 
-    ours: np.ndarray = labelled("1", "by this model", "entry")
-    theirs: np.ndarray = labelled("1", "by the twin", "entry")
-    difference: np.ndarray = labelled("1", "of both", "entry")
+    ours: np.ndarray = labelled("SI", "by this model", "entry")
+    theirs: np.ndarray = labelled("SI", "by the twin", "entry")
+    difference: np.ndarray = labelled("SI", "of both", "entry")
 
     @derived("1", "difference over theirs", "entry")
     def share(self) -> np.ndarray:

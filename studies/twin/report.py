@@ -102,15 +102,12 @@ def gap_rows(result: TwinResult) -> list[list[str]]:
     for one in compared(result):
         factor, unit = {"m": (1e6, "µm"), "rad": (1e6, "µrad")}.get(one.unit, (1.0, one.unit))
         control = "with control" if one.is_controlled else "without control"
+        parts = one.gap.ours, one.gap.theirs, one.gap.difference
         for k, entry in enumerate(one.entries):
-            numbers = (one.gap.ours[k], one.gap.theirs[k], one.gap.difference[k])
-            texts = (f"{factor * x:.4g} {unit}" for x in numbers)
+            texts = (f"{factor * x[k]:.4g} {unit}" for x in parts)
             rows.append([f"{one.name}, {entry}, {control}", *texts, _percent(one.gap.share[k])])
         if len(one.entries) > 1:
-            together = (
-                float(np.linalg.norm(x)) / len(x) ** 0.5
-                for x in (one.gap.ours, one.gap.theirs, one.gap.difference)
-            )
+            together = (float(np.linalg.norm(x)) / len(x) ** 0.5 for x in parts)
             texts = (f"{factor * x:.4g} {unit}" for x in together)
             rows.append([f"{one.name}, all together, {control}", *texts, _percent(one.gap.whole)])
     return rows
@@ -170,7 +167,7 @@ def verdict(result: TwinResult) -> str:
 
 def twin_document(result: TwinResult) -> TwinDocument:
     """The document of a comparison."""
-    window = result.window
+    window, (ours, theirs) = result.window, damping_ratios(result)
     return TwinDocument(
         title=result.study.title,
         verdict=verdict(result),
@@ -181,8 +178,8 @@ def twin_document(result: TwinResult) -> TwinDocument:
         window_length=(window.stop - window.start) * result.plan.electronics.period,
         compared=compared(result),
         changes=result.causes,
-        damping_ratio=damping_ratios(result)[0],
-        twin_damping_ratio=damping_ratios(result)[1],
+        damping_ratio=ours,
+        twin_damping_ratio=theirs,
         gain_margin=float(result.loop.gain_margin),
         growth=result.growth,
         study=result.study,

@@ -22,11 +22,11 @@ from studies.engine.runs import run_study
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.reference import lagrangian as reference
+from studies.results.labelled import Variable
 from studies.show.figures import styled
 from studies.show.sketch import link_parts, sketch, standing
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table
-from studies.store import Variable
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure
 from studies.study.paths import EACH_LINK, field_value
 from studies.study.spec import load_study

@@ -12,7 +12,8 @@ import xarray
 
 from studies import store
 from studies.errors import StudyError, field_error, nearest, nearest_field
-from studies.store import LazyArray, Variable, check_target, read_store, write_store
+from studies.results.labelled import Variable
+from studies.store import LazyArray, check_target, read_store, write_store
 
 VARIABLES = {
     "case": Variable(np.array([10, 20, 30]), ("case",), "1", "number of the case"),
@@ -161,7 +162,8 @@ def test_failed_rename_keeps_the_old_file_and_no_temporary(path, monkeypatch):
 def test_full_disk_is_one_message_and_leaves_nothing(tmp_path):
     code = (
         "import resource, sys, numpy as np\n"
-        "from studies.store import StudyError, Variable, write_store\n"
+        "from studies.results.labelled import Variable\n"
+        "from studies.store import StudyError, write_store\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))\n"
         "try: write_store(sys.argv[1], {'x': Variable(np.ones(100_000), ('n',), 'm', 'x')}, {})\n"
         "except StudyError as error: print('refused', error)\n"

@@ -30,9 +30,10 @@ from studies.engine.folder import (
 from studies.engine.results import DIGEST, baseline_digest, baseline_id, read_sweep
 from studies.errors import StudyError
 from studies.publish import publish, replacing
+from studies.results.labelled import Variable
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table
-from studies.store import Variable, write_store
+from studies.store import write_store
 from studies.sweeps import run as run_module
 from studies.sweeps.run import case_content, make_plan, run_sweep
 from studies.tuning.folder import open_tuning

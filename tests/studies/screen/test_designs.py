@@ -19,6 +19,7 @@ from studies.engine.fidelity import Agreement
 from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import run_uncontrolled
 from studies.errors import StudyError
+from studies.results.labelled import Variable
 from studies.screen import report, selection, shards
 from studies.screen.local import LocalScreener
 from studies.screen.report import margin_rows, quantile_rows, summary_lines, write_screen_report
@@ -37,7 +38,7 @@ from studies.screen.tally import (
 )
 from studies.space.spec import load_sweep
 from studies.space.table import build_table
-from studies.store import Variable, read_store, write_store
+from studies.store import read_store, write_store
 from studies.sweeps.run import run_sweep
 from tests.bare import parse_sweep
 from tests.pages import text_of

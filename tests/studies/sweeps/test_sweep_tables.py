@@ -19,11 +19,11 @@ from studies.engine import design, results
 from studies.engine.columns import axis_variables, case_variables, label_of
 from studies.engine.results import SweepData, metric_values
 from studies.errors import ResolutionWarning, StudyError
+from studies.results.labelled import Variable
 from studies.show.listing import Rows, print_rows
 from studies.single.run import Replay
 from studies.space.indices import elementary_effects, sobol_indices
 from studies.space.table import build_table
-from studies.store import Variable
 from studies.study.margin import GUESSED
 from studies.sweeps.documents import best_document
 from studies.sweeps.dry_run import axis_rows
@@ -308,7 +308,8 @@ def test_cases_that_cannot_be_ranked_are_counted():
     data = usual(codes=[0, 0, 0, 5, 5, 3, 0, 0], gain_margin=margin)
     text = unranked_text(data, "gain_margin")
     assert text == "2 cases of 5 with status ok without gain_margin: not ranked"
-    assert best_document(data, "gain_margin").warnings[-1] == text
+    cases = ranked_cases(data, "gain_margin")
+    assert best_document(data, "gain_margin", cases).warnings[-1] == text
     assert unranked_text(data, "residual_rms") == ""
 
 
