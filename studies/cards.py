@@ -7,17 +7,18 @@ Rows, words and pictures are those of the reports.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from io import BytesIO
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from studies.show import figures
+from studies.show import figures, pages
 from studies.show.pages import inline_image, render
 from studies.show.units import count_text
 from studies.study.labels import describe
-from studies.study.margin import margin_in_db, margin_text, stretch_text
+from studies.study.margin import margin_in_db, stretch_text
 
 #: Rows of a table, and width [inch] and resolution [1/inch] of a picture.
 MOST, WIDTH, DPI = 6, 5.6, 90
@@ -39,11 +40,13 @@ def card(result: Any) -> str:
     Args:
         result: of a type in CARDS.
     """
+    if (module := SAY.get(type(result).__name__)) is not None:
+        return pages.card(import_module(module).say(result))
     with figures.styled():
         made = CARDS[type(result).__name__](result)
         image = inline_image(_png(made.figure), made.title) if made.figure is not None else ""
     parts = made._asdict() | {"title": made.title or "untitled", "image": image}
-    return render("show/card.html", **parts)
+    return render("show/old_card.html", **parts)
 
 
 def _png(figure: Figure) -> bytes:
@@ -132,24 +135,6 @@ def _fit(fitted: Any) -> Card:
     return Card(fitted.study.title, statements(fitted), heads, rows, figure=drawing())
 
 
-def _certificate(certificate: Any) -> Card:
-    """Of `certify` and `spillover_design`."""
-    from studies.results.labelled import records
-    from studies.spillover.plots import margins
-    from studies.spillover.report import residual_text, statements
-
-    lines = [*statements(certificate), residual_text(certificate), *certificate.notes]
-    plants = sorted(records(certificate, certificate.ROWS), key=lambda x: x["gain_margin"])
-    names = "basis", "mismatch", "plant_modes", "gain_margin", "broken_by"
-    rows = [[str(plant[name]) or "-" for name in names] for plant in plants[:MOST]]
-    for row, plant in zip(rows, plants, strict=False):
-        row[3] = margin_text(plant["gain_margin"], 3)
-    figure, ax = figures.one_panel(2.6)
-    margins(certificate, ax)
-    heads = [name.replace("_", " ") for name in names]
-    return Card(certificate.study.title, [x for x in lines if x], heads, rows, figure=figure)
-
-
 def _laws(findings: Any) -> Card:
     """Of `run_laws`."""
     from studies.laws.findings import verdict
@@ -197,13 +182,14 @@ def _modes(modes: Any) -> Card:
     return Card("Natural modes of the machine", [], heads, rows, figure=figure)
 
 
+#: Module with the function `say`, by the name of the type.
+SAY = {"Certificate": "studies.spillover.say"}
 #: By the name of the type.
 CARDS: dict[str, Callable[[Any], Card]] = {
     "Run": _run,
     "Outcome": _sweep,
     "TuneFindings": _tuning,
     "Fitted": _fit,
-    "Certificate": _certificate,
     "LawFindings": _laws,
     "Exported": _export,
     "NamedModes": _modes,

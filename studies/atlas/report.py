@@ -23,7 +23,7 @@ from studies.atlas.subsets import (
     setting_label,
 )
 from studies.atlas.workspace import MAP_MODES, Map
-from studies.show.pages import page
+from studies.show.pages import old_page as page
 from studies.show.sketch import CAPTION
 from studies.show.units import span
 from studies.study.window import residual_delay

@@ -8,7 +8,7 @@ from studies.commission.findings import CommissionFindings
 from studies.commission.spec import MeasuredSpec
 from studies.commission.stages import STAGES
 from studies.fitting.spec import number_unit
-from studies.show.pages import page
+from studies.show.pages import old_page as page
 from studies.study.margin import margin_text
 
 

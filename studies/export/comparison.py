@@ -32,7 +32,7 @@ from studies.export.verify import load_code, reference_run
 from studies.publish import announce, check_folder, publish, shown, working_folder
 from studies.results.document import json_text
 from studies.results.labelled import Labelled, derived, labelled, told, unwritten
-from studies.show.pages import page
+from studies.show.pages import old_page as page
 from studies.study.margin import margin_text
 from studies.study.spec import Study
 

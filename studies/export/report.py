@@ -17,7 +17,7 @@ from studies.export.fixed import MARGIN, FixedPoint
 from studies.export.fixed_blocks import FixedBlocks
 from studies.export.job import ExportResult
 from studies.export.verify import AIM, Verification
-from studies.show.pages import page
+from studies.show.pages import old_page as page
 from studies.study.margin import caution
 
 #: In place of "ok".

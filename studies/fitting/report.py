@@ -14,7 +14,7 @@ from studies.fitting.kinds.contract import Line, Numbers
 from studies.fitting.plots import MOST
 from studies.fitting.spec import number_unit
 from studies.fitting.statistics import REGION, UNKNOWN, Answer, Direction, Misfit, region_rise
-from studies.show.pages import page
+from studies.show.pages import old_page as page
 
 #: Experiments in the report.
 SHOWN = 5

@@ -13,7 +13,7 @@ from studies.laws.judging import FIGURES, MOVES
 from studies.laws.machines import spread_of
 from studies.laws.ranking import CONFIDENCE
 from studies.laws.tuning import AGREE, LATE, Tuned
-from studies.show.pages import page
+from studies.show.pages import old_page as page
 from studies.show.sketch import CAPTION
 from studies.show.units import number
 from studies.study.margin import delay_text, margin_text

@@ -21,7 +21,7 @@ from studies.screen.shards import CANDIDATES, ScreenRequest, axis_columns
 from studies.screen.stored import BEST
 from studies.screen.tally import LEFT_OUT, quantile
 from studies.show.figures import styled
-from studies.show.pages import page
+from studies.show.pages import old_page as page
 from studies.show.units import count_text, headed, readable
 from studies.show.words import motion_text
 from studies.study.margin import margin_text

@@ -1,12 +1,11 @@
 """Reports as web pages, and all other templates (Jinja2).
 
 A page is one HTML file that contains its figures, the files it refers to and the versions that made
-it. It runs no scripts and loads nothing, so it opens offline, in an email, and in many years.
+it. It runs no scripts and loads nothing, so it opens offline, in an email, and in many years. One
+template, `show/page.html`, prints every `Report`; `show/card.html` prints the same for a notebook.
 
-A template is in the folder of the module that fills it: `report.html` next to `report.py`. That of
-a report extends `show/page.html` with the blocks `title`, `summary` and `sections`, and writes
-tables and figures with the two macros of `show/macros.html`. Whatever a value contains is shown as
-text. A name without a value is an error.
+Other templates are in the folder of the module that fills them. Whatever a value contains is shown
+as text. A name without a value is an error.
 """
 
 from __future__ import annotations
@@ -14,16 +13,22 @@ from __future__ import annotations
 import re
 from base64 import b64encode
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cache
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup, escape
+from matplotlib.figure import Figure
 
 from studies import config, passport
 from studies.errors import printable
-from studies.publish import FAULT
+from studies.publish import FAULT, REPORT
+from studies.show import figures
+from studies.show.listing import Rows
+from studies.show.report import Drawing, Report, sentence
 from studies.show.units import count_text, headed, number, span
 from studies.study.entries import links_text
 from studies.study.labels import describe
@@ -36,6 +41,8 @@ _ROOT = Path(__file__).parents[1]
 _JOINT = re.compile(r"(?<=[A-Za-z][_./])(?=\w)|(?<=\w)(?=\[)")
 #: Images with more pixels than this across keep a readable width on a narrow screen.
 WIDE = 550
+#: Rows of a card's table, and width [inch] and resolution [1/inch] of its picture.
+MOST, CARD_WIDTH, CARD_DPI = 6, 5.6, 90
 
 
 def _short(value: float, digits: int = 4) -> str:
@@ -64,9 +71,10 @@ def _unbroken(text: str) -> Markup:
     return Markup(re.sub(" (?=[%†])", "\N{NO-BREAK SPACE}", str(text)))
 
 
-def code(text: str) -> Markup:
-    """A text of this program, in which `names` stand between backticks."""
-    return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(text))))
+def prose(text: str) -> Markup:
+    """A text of this program, with `code` and **strong** words, in one piece."""
+    shown = re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(" ".join(text.split()))))
+    return _unbroken(re.sub(r"\*\*([^*]+)\*\*", r"<b>\1</b>", shown))
 
 
 def _anchor(title: str) -> str:
@@ -89,7 +97,9 @@ FILTERS: dict[str, Callable[..., str]] = {
     "status": describe,
     "breakable": _breakable,
     "unbroken": _unbroken,
-    "code": code,
+    "code": prose,
+    "prose": prose,
+    "sentence": sentence,
     "anchor": _anchor,
 }
 
@@ -123,7 +133,64 @@ def render(name: str, /, **values: Any) -> str:
     return _environment().get_template(name).render(values)
 
 
-def page(
+def page(report: Report, folder: Path | None = None) -> str:
+    """A report as a self-contained web page.
+
+    Args:
+        report: what it tells.
+        folder: with its figures, PNG or GIF; None: a page without images.
+
+    Returns:
+        HTML.
+
+    Raises:
+        ValueError: a figure that is not in the folder.
+    """
+    chapters = [x for x in report.chapters if x]
+    about = next((x for x in report.files.values() if isinstance(x, Study)), None)
+    return render(
+        "show/page.html",
+        report=replace(report, chapters=chapters),
+        image=lambda name, caption: _image(folder, name, caption),
+        facts=config.origin() | _verified(about),
+        files={title: _file(content) for title, content in report.files.items()},
+    )
+
+
+def write_report(report: Report, folder: Path, has_pdf: bool = False) -> None:
+    """Write the figures of a report and its page into a folder.
+
+    Raises:
+        StudyError: a file cannot be written.
+    """
+    drawings = {part.name: part.draw for part in report.parts if isinstance(part, Drawing)}
+    figures.draw(folder, drawings, has_pdf)
+    (folder / REPORT).write_text(page(report, folder), encoding="utf-8")
+
+
+def card(report: Report) -> str:
+    """A report as a notebook shows it: its result, the first rows of its table, a small picture."""
+    table = next((x for x in report.parts if isinstance(x, Rows)), Rows([], []))
+    drawings = (x for x in report.parts if isinstance(x, Drawing))
+    first, *others = [*drawings, None]
+    shown = others[0] if others and others[0] else first  # the first one is the machine
+    image = ""
+    if shown:
+        with figures.styled():
+            image = inline_image(_png(shown.draw()), shown.caption)
+    return render(
+        "show/card.html", report=report, image=image, heads=table.heads, rows=table.rows[:MOST]
+    )
+
+
+def _png(figure: Figure) -> bytes:
+    figure.set_figwidth(min(CARD_WIDTH, figure.get_figwidth()))
+    image = BytesIO()
+    figure.savefig(image, format="png", dpi=CARD_DPI)
+    return image.getvalue()
+
+
+def old_page(
     name: str,
     folder: Path | None,
     appended: Study | Mapping[str, Study | str],
@@ -178,14 +245,17 @@ def _verified(study: Study | None) -> dict[str, str]:
     return {} if study is None else {"verified": text}
 
 
-def _image(folder: Path | None, file: str, caption: str) -> Markup:
+def _image(folder: Path | None, name: str, caption: str) -> Markup:
     if folder is None:
         return Markup()
-    if (fault := (folder / file).with_suffix(FAULT)).is_file():
+    name = name.removesuffix(".png")
+    if (fault := folder / f"{name}{FAULT}").is_file():
         return Markup("<p>{}</p>").format(fault.read_text(encoding="utf-8"))
-    if not (folder / file).is_file():
-        raise ValueError(f"the report shows {file!r}, which is not among its images")
-    return inline_image((folder / file).read_bytes(), caption)
+    files = [folder / f"{name}{ending}" for ending in (".png", ".gif")]
+    file = next((file for file in files if file.is_file()), None)
+    if file is None:
+        raise ValueError(f"the report shows {name!r}, which is not among its images")
+    return inline_image(file.read_bytes(), caption)
 
 
 def inline_image(data: bytes, caption: str) -> Markup:

@@ -19,7 +19,7 @@ from studies.engine.poles import HEADER, difference, pole_rows
 from studies.engine.run_data import chord_deflection
 from studies.engine.runs import Run
 from studies.show import figures
-from studies.show.pages import page
+from studies.show.pages import old_page as page
 from studies.show.sketch import CAPTION
 from studies.show.units import is_cut_off, number
 from studies.show.words import control_text, motion_text

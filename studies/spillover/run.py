@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from rich.console import Console
 
 from jaxmodel.beam import BASES
 from jaxmodel.changes import MachineChange
-from jaxmodel.laws import LAWS
 from studies.engine.breaking import TOLERANCES, smallest_change
 from studies.engine.controller import fixed_controller
 from studies.engine.design import Design, as_design
@@ -24,13 +19,12 @@ from studies.publish import REPORT, announce, check_folder, publish
 from studies.reading import read_json
 from studies.results.document import json_text
 from studies.results.labelled import variables
-from studies.show import figures
-from studies.show.sketch import sketch
-from studies.spillover import plots
+from studies.show.pages import write_report
+from studies.show.report import print_result
 from studies.spillover.certificate import Certificate, certify
 from studies.spillover.fast_move import run_fast_move
 from studies.spillover.proofs import prove
-from studies.spillover.report import report, residual_text, statements
+from studies.spillover.say import say
 from studies.store import write_store
 from studies.study.margin import GUESSED
 from studies.study.spec import Study
@@ -81,22 +75,17 @@ def spillover_design(
         if has_proofs:
             phases.begin("prove", "every number of modes, and a box of machines")
             certificate = certificate.replace(proofs=prove(fixed_controller(study)))
-        for text in statements(certificate):
-            console.print(text, soft_wrap=True)
         phases.begin("smallest change", "of the machine that breaks the design")
         change = smallest_change(fixed_controller(certificate.study), tolerances)
         certificate = certificate.replace(smallest_change=change)
-        console.print(change.text, soft_wrap=True)
         phases.begin("fast move", "of the nominal machine, with and without control")
         certificate = _with_fast_move(certificate)
-        if residual := residual_text(certificate):
-            console.print(residual, soft_wrap=True)
         phases.begin("draw")
         with publish(out) as staging:
             write_store(staging / DATA, variables(certificate), run_attributes(study))
             (staging / DOCUMENT).write_text(json_text(certificate), encoding="utf-8")
-            _draw(staging, certificate, has_pdf)
-            (staging / REPORT).write_text(report(certificate, staging), encoding="utf-8")
+            write_report(report := say(certificate), staging, has_pdf)
+    print_result(report, console)
     for note in (*certificate.notes, GUESSED):
         console.print(note, soft_wrap=True)
     announce(console, out / REPORT, ", data and figures in the same folder")
@@ -125,19 +114,3 @@ def _with_fast_move(certificate: Certificate) -> Certificate:
         return certificate.replace(fast_move=run_fast_move(certificate.study))
     except StudyError as error:
         return certificate.replace(notes=(*certificate.notes, f"no fast move: {error}"))
-
-
-def _draw(folder: Path, certificate: Certificate, has_pdf: bool) -> None:
-    def panel(plot: Callable[[Certificate, Axes], object], height: float) -> Figure:
-        figure, axes = figures.new_figure(1, 1, height)
-        plot(certificate, axes[0, 0])
-        return figure
-
-    drawings = {
-        "margins": partial(panel, plots.margins, 3.6),
-        "damping": partial(panel, plots.mode_damping, 2.65),
-    }
-    if LAWS[certificate.study.control.law].channel == "mode":
-        drawings["leakage"] = partial(plots.leakage, certificate)
-    figures.draw(folder, drawings, has_pdf)
-    figures.draw(folder, {"machine": partial(sketch, certificate.study)})

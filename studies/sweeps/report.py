@@ -22,7 +22,7 @@ from studies.engine.results import (
 from studies.errors import StudyError, shown
 from studies.publish import REPORT, publish
 from studies.show.figures import styled
-from studies.show.pages import page
+from studies.show.pages import old_page as page
 from studies.show.sketch import CAPTION, sketch
 from studies.show.units import readable
 from studies.show.words import motion_text

@@ -14,7 +14,7 @@ from jaxmodel.loop_figures import MARGIN_MODES, MARGINS, PEAKS
 from jaxmodel.metrics import METRICS
 from studies.engine.fidelity import rank_correlation
 from studies.engine.poles import HEADER, difference, pole_rows
-from studies.show.pages import page
+from studies.show.pages import old_page as page
 from studies.show.sketch import CAPTION
 from studies.show.units import headed, is_cut_off, number, readable, settling_text
 from studies.study.entries import parse_entries

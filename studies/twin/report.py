@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from studies.results.labelled import Labelled, labelled, told
-from studies.show.pages import page
+from studies.show.pages import old_page as page
 from studies.show.words import control_text, motion_text
 from studies.study.margin import margin_text
 from studies.study.spec import Study

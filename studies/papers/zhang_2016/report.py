@@ -38,7 +38,7 @@ from studies.papers.zhang_2016.tables import (
     settling_rows,
     table_1_rows,
 )
-from studies.show.pages import page
+from studies.show.pages import old_page as page
 from studies.show.sketch import CAPTION
 from studies.study.window import residual_delay
 

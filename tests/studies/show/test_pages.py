@@ -10,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from jinja2 import ChoiceLoader, DictLoader
+from jinja2 import DictLoader
 from matplotlib.figure import Figure
 
-import studies
 from studies.show import pages
 from studies.show.figures import SMALL, WIDTH, is_wide, new_figure, styled
+from studies.show.listing import Rows
 from studies.show.pages import page, render
+from studies.show.report import Drawing, Items, Report, chapter, sentence
 from studies.study import spec as spec_module
 from studies.study.spec import Study, parse_study
 from studies.study.template import own_text, toml_text
@@ -31,31 +32,21 @@ from tests.pages import (
 )
 from tests.sweeps import MIXED, small
 
-REPORT = """{% extends "show/page.html" %}
-{% from "show/macros.html" import table, figure with context %}
-{% block title %}{{ title }}{% endblock %}
-{% block summary %}<p>{{ text }}</p>{% endblock %}
-{% block sections %}
-{{ section("Numbers of " ~ title) }}
-<ul><li>{{ text }}</li></ul>
-{{ table(heads, rows) }}
-{% if file %}{{ figure(file, "Bending of `link`, *all*") }}{% endif %}
-{% endblock %}
-"""
-
 
 @pytest.fixture
 def fill_report(tmp_path, monkeypatch):
-    """Function that fills in REPORT."""
-    loader = ChoiceLoader([DictLoader({"report.html": REPORT}), pages._environment().loader])
-    monkeypatch.setattr(pages._environment(), "loader", loader)
+    """Function that makes a page of a small report."""
     monkeypatch.setattr(pages.config, "origin", lambda: {"python": "3", "jax": "<1>"})
 
     def make(title="Title", text="", heads=(), rows=(), file="", image=b"", files=None):
         if image:
             (tmp_path / file).write_bytes(image)
-        values = {"title": title, "text": text, "heads": heads, "rows": rows, "file": file}
-        return page("report.html", tmp_path, files or {}, **values)
+        name = file.removesuffix(".png")
+        drawing = Drawing(name, "Bending of `link`, *all*", Figure) if file else None
+        parts = chapter(
+            f"Numbers of {title}", Items([text]), Rows(list(heads), list(rows)), drawing
+        )
+        return page(Report(title, [text], "why?", "none", [], [parts], files or {}), tmp_path)
 
     return make
 
@@ -81,7 +72,7 @@ def test_a_template_becomes_a_whole_page(fill_report):
     assert found.images == [((400, 200), "Bending of link, *all*")]
     assert found.rows == [[2, 2, 2, 2], [2, 2]]
     for part in (
-        "E = ω²q² in <b>µm</b>, 5\xa0%",
+        "E = ω²q² in <b>µm</b>, 5\xa0%.",
         "1.2\xa0†",
         "b | c",
         "`k`",
@@ -107,22 +98,11 @@ def test_texts_are_escaped_in_pages_only(monkeypatch):
     assert render("page.html", text="a < b & c") == "<p>a &lt; b &amp; c</p>"
 
 
-REPORTS = {x.parent.name: x for x in sorted(Path(studies.__file__).parent.glob("**/report.html"))}
-
-
-@pytest.mark.parametrize("name", REPORTS)
-def test_a_report_begins_with_its_result(name):
+def test_a_report_begins_with_its_result(fill_report):
     """Then come the question and the next steps, in this order."""
-    path = REPORTS[name]
-    text = path.read_text(encoding="utf-8")
-    heads = re.findall(r"<b>([A-Z][a-z ]+):</b>", text)
-    assert [x for x in heads if x in ("Result", "Question", "Next steps")] == [
-        "Result",
-        "Question",
-        "Next steps",
-    ]
-    first = text.partition("{% block summary %}\n")[2]
-    assert first.startswith("<p><b>Result:</b>")
+    text = text_of(fill_report(text="**it** moves by 5 %"))
+    first = ["# Title", "**Result:** **It** moves by 5 %.", "**Question:** Why?"]
+    assert text.split("\n\n")[:4] == [*first, "**Next steps:** none"]
 
 
 def test_small_text_in_a_figure_is_found():
@@ -142,7 +122,7 @@ def test_numbers_need_a_logarithmic_scale_if_all_are_positive_and_far_apart():
 
 
 def test_a_figure_without_its_image_is_a_fault_of_the_program(fill_report):
-    with pytest.raises(ValueError, match="'none.png'"):
+    with pytest.raises(ValueError, match="'none'"):
         fill_report(file="none.png")
 
 
@@ -171,14 +151,15 @@ def test_a_figure_without_its_image_is_a_fault_of_the_program(fill_report):
     ],
 )
 def test_texts_of_users_are_shown_as_they_are(fill_report, text):
-    html = fill_report(text, text, [text], [[text]])
+    told = text.replace("`", "'")  # between backticks is code, wherever that comes from
+    html = fill_report(text, told, [text], [[text]])
     found = parsed(html)
-    assert found.title == text and found.text.count(text) == 7  # twice in the heading and its link
-    assert text_of(html).splitlines()[:3] == [f"# {text}", "", text]
+    assert found.title == text and found.text.count(text) >= 5
+    assert text_of(html).startswith(f"# {text}\n\n**Result:** {sentence(told)}\n")
     assert tables_of(html) == {f"Numbers of {text}": [{text: [text]}]}
     assert set(found.tags) <= {
         *["html", "head", "meta", "title", "style", "body", "main", "h1", "h2", "p", "a"],
-        *["div", "table", "thead", "tbody", "tr", "th", "td", "ul", "li", "wbr"],
+        *["div", "table", "thead", "tbody", "tr", "th", "td", "ul", "li", "wbr", "b"],
     }
 
 

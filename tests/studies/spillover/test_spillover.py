@@ -32,12 +32,13 @@ from studies.engine.stability import LoopFigures, loop_report
 from studies.errors import StudyError
 from studies.results.breaking import BreakingChange, ChangedNumber
 from studies.results.labelled import document
+from studies.show import figures
 from studies.spillover import ModelMismatch, certificate, certify, patch_lengths
 from studies.spillover import run as spillover_run
 from studies.spillover.fast_move import run_fast_move
 from studies.spillover.plants import LoopBuilder, all_plants, pad_channels
 from studies.spillover.proofs import BOX, AllModes, Proofs, ProvenBox
-from studies.spillover.report import _largest
+from studies.spillover.say import _largest
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.template import study_template
 from studies.study.window import residual_delay
@@ -166,7 +167,7 @@ def test_the_largest_leakage_is_named_by_its_modes_and_plant():
     leakage[1, 0, 2, 1, 3], leakage[0, 1] = -0.7, np.nan
     variants = np.array([["a", "b"], ["c", "d"]])[..., None]
     found = _largest(SimpleNamespace(n_controlled=2, variants=variants), leakage)
-    assert found == {"size": 0.7, "mode": 6, "controlled": 2, "plant": "c"}
+    assert found == (0.7, 6, 2, "c")
 
 
 def test_plants_that_do_not_exist_are_left_out():
@@ -443,7 +444,7 @@ def few(move):
 def undrawn():
     """Figures are not drawn."""
     with mock.patch.object(
-        spillover_run.figures,
+        figures,
         "save",
         lambda _, out, name, __: (out / f"{name}.png").write_bytes(b"-"),
     ):
@@ -464,18 +465,19 @@ def test_command_passes_a_design_and_writes_everything(capsys, tmp_path, move):
     )
     assert code == 0 and "passed: gain margin 2.88, 2 required" in text
     assert CHANGE.text in text
-    figures = [
-        f"{name}.{kind}" for name in ("margins", "damping", "leakage") for kind in ("png", "pdf")
+    drawn = [
+        f"{name}.{kind}"
+        for name in ("machine", "margins", "damping", "leakage")
+        for kind in ("png", "pdf")
     ]
-    files = {"report.html", "certificate.json", "spillover.h5", *figures}
-    assert {path.name for path in out.iterdir()} == files | {"machine.png"}
+    files = {"report.html", "certificate.json", "spillover.h5", *drawn}
+    assert {path.name for path in out.iterdir()} == files
     assert (out / "damping.pdf").read_bytes()[:5] == b"%PDF-"
     report = text_of((out / "report.html").read_text(encoding="utf-8"))
-    assert report.startswith(
-        "# Spillover certificate passed: gain margin 2.88 (9.2 dB), 2 required"
-    )
+    assert report.startswith("# Spillover certificate passed: gain margin 2.88, 2 required")
+    assert "Smallest margin: 2.88 (9.2 dB)" in report
     assert all(f"![{name}]" in report for name in ("margins", "damping", "leakage"))
-    assert "studies laws DESIGN" in report and "Not covered" in report
+    assert "Not covered" in report
     page = parsed((out / "report.html").read_text())
     assert len(page.images) == 4 and page.title.startswith("Spillover certificate passed")
     data = json.loads((out / "certificate.json").read_text())
@@ -521,10 +523,10 @@ def test_command_fails_a_design(capsys, tmp_path):
     assert "no fast move: not today" in text
     report = text_of((out / "report.html").read_text(encoding="utf-8"))
     assert (
-        report.startswith("# Spillover certificate failed: gain margin")
+        report.startswith("# Spillover certificate failed by mode")
         and "## The fast move" not in report
     )
-    assert "| **no** |" in report and "- no fast move: not today" in report
+    assert "| no |" in report and "- No fast move: not today" in report
     data = json.loads((out / "certificate.json").read_text())
     jsonschema.validate(data, schema("spillover"))
     assert not data["is_passed"]

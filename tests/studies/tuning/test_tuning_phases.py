@@ -205,7 +205,7 @@ def test_a_figure_that_fails_costs_no_result(tmp_path):
     assert (tmp_path / "empty.png").is_file() and not (tmp_path / "curves.png").exists()
     from studies.show.pages import _image
 
-    assert "Data cannot be log-scaled" in _image(tmp_path, "curves.png", "the curves")
+    assert "Data cannot be log-scaled" in _image(tmp_path, "curves", "the curves")
 
 
 def test_a_descent_without_an_allowed_design_is_drawn(tmp_path):

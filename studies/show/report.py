@@ -1,0 +1,93 @@
+"""What a command tells of its result, as data: page, console and notebook print the same.
+
+Each feature has one function `say(result) -> Report`, in its module `say`. Texts may have `code`
+between backticks and **strong** words; lines of a long one are joined.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from studies.show.listing import Rows
+from studies.show.sketch import CAPTION, sketch
+from studies.study.spec import Study
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure: the name of its file, what it shows, and what draws it."""
+
+    name: str
+    caption: str
+    draw: Callable[[], Figure]
+
+
+@dataclass(frozen=True)
+class Items:
+    """A list of texts."""
+
+    texts: Sequence[str]
+
+    def __bool__(self) -> bool:
+        return bool(self.texts)
+
+
+#: What stands below a heading; what is empty is left out.
+Part = str | Rows | Drawing | Items | None
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """A heading, and what stands below it."""
+
+    title: str
+    parts: Sequence[Part]
+
+
+@dataclass(frozen=True)
+class Report:
+    """What is told: the result in sentences first, then what was asked, and what to do next."""
+
+    title: str
+    result: Sequence[str]
+    question: str
+    next_steps: str
+    top: Sequence[Part]  # below these
+    chapters: Sequence[Chapter | None]
+    files: Mapping[str, Study | str]  # to append, by title; the first study is the one reported on
+    caveat: str = ""  # what is to be said of margins, if there are any; "": they leave stretch out
+
+    @property
+    def parts(self) -> list[Part]:
+        """All of them, in order."""
+        return [*self.top, *(x for chapter in self.chapters if chapter for x in chapter.parts)]
+
+
+def chapter(title: str, *parts: Part) -> Chapter | None:
+    """A heading with what is not empty of some parts; None if all are."""
+    shown = [part for part in parts if part and (part.rows if isinstance(part, Rows) else True)]
+    return Chapter(title, shown) if shown else None
+
+
+def machine(study: Study) -> Drawing:
+    """The sketch of a study's machine."""
+    return Drawing("machine", CAPTION, partial(sketch, study))
+
+
+def sentence(text: str) -> str:
+    """A text with a capital and a full stop."""
+    start = text[:2] if text.startswith("**") else ""
+    rest = text.removeprefix(start)
+    closed = rest if rest.rstrip("*").endswith((".", "!", "?", ":")) else f"{rest}."
+    return start + rest[:1].upper() + closed[1:] if rest else ""
+
+
+def print_result(report: Report, console: Console) -> None:
+    """Print the result, a sentence a line."""
+    for text in report.result:
+        console.print(text.replace("**", ""), soft_wrap=True)
