@@ -135,16 +135,6 @@ def _fit(fitted: Any) -> Card:
     return Card(fitted.study.title, statements(fitted), heads, rows, figure=drawing())
 
 
-def _laws(findings: Any) -> Card:
-    """Of `run_laws`."""
-    from studies.laws.findings import verdict
-    from studies.laws.plots import comparison
-    from studies.laws.report import HEADS, table_rows
-
-    rows = table_rows(findings)[:MOST]
-    return Card(findings.study.title, verdict(findings), HEADS, rows, figure=comparison(findings))
-
-
 def _export(export: Any) -> Card:
     """Of `export_design`."""
     from studies.show.sketch import sketch
@@ -183,14 +173,17 @@ def _modes(modes: Any) -> Card:
 
 
 #: Module with the function `say`, by the name of the type.
-SAY = {"Certificate": "studies.spillover.say"}
+SAY = {
+    "Certificate": "studies.spillover.say",
+    "CommissionFindings": "studies.commission.say",
+    "LawFindings": "studies.laws.say",
+}
 #: By the name of the type.
 CARDS: dict[str, Callable[[Any], Card]] = {
     "Run": _run,
     "Outcome": _sweep,
     "TuneFindings": _tuning,
     "Fitted": _fit,
-    "LawFindings": _laws,
     "Exported": _export,
     "NamedModes": _modes,
 }

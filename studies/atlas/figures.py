@@ -286,7 +286,7 @@ def _responses(findings: AtlasFindings) -> Figure:
     return figure
 
 
-#: What draws each figure, by its name, and those of subsets of modes.
+#: What draws each figure, by its name; the last two need subsets of modes.
 FIGURES: dict[str, Callable[[AtlasFindings], Figure]] = {
     "subsets": _subsets,
     "helps": _effects,
@@ -298,8 +298,6 @@ FIGURES: dict[str, Callable[[AtlasFindings], Figure]] = {
     "platform": _platform,
     "vibration": _vibration_after,
     "responses": _responses,
-}
-MODE_FIGURES: dict[str, Callable[[AtlasFindings], Figure]] = {
     "mode_shares": _mode_shares,
     "interactions": _interactions,
 }

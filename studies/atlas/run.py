@@ -6,7 +6,6 @@ where modes 2 and up matter.
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +14,9 @@ from rich.console import Console
 from jaxmodel import status
 from studies import config
 from studies.atlas.attribution import interaction, shapley
-from studies.atlas.figures import FIGURES, MODE_FIGURES, write_animation
+from studies.atlas.figures import FIGURES, write_animation
 from studies.atlas.findings import AtlasFindings, adc_step, evaluate_atlas
-from studies.atlas.report import report
+from studies.atlas.say import say
 from studies.atlas.subsets import (
     CHOICES,
     MATTERS,
@@ -37,10 +36,9 @@ from studies.engine.folder import ATLASES, locked_folder, refuse_existing
 from studies.engine.progress import Phases
 from studies.engine.run_data import run_attributes
 from studies.errors import StudyError
-from studies.publish import REPORT, publish
+from studies.publish import publish
 from studies.results.labelled import Variable, Variables, variables
-from studies.show.figures import draw
-from studies.show.sketch import sketch
+from studies.show.pages import write_report
 from studies.space.spec import SweepSpec
 from studies.store import axis_sizes, write_store
 from studies.study.spec import Study
@@ -138,13 +136,10 @@ def _finish(
     with serial_blas():
         findings = evaluate_atlas(study, *found, on_progress)
     phases.begin("draw")
-    drawn = FIGURES if findings.subsets is None else FIGURES | MODE_FIGURES
-    with publish(out, [f"{x}.{kind}" for x in MODE_FIGURES for kind in ("png", "pdf")]) as staging:
+    with publish(out, [f"{x}.{kind}" for x in FIGURES for kind in ("png", "pdf")]) as staging:
         write_store(staging / DATA, atlas_variables(findings), run_attributes(study))
-        draw(staging, {name: partial(plot, findings) for name, plot in drawn.items()}, has_pdf)
-        draw(staging, {"machine": partial(sketch, study)})
         write_animation(findings, staging)
-        (staging / REPORT).write_text(report(findings, dropped, staging), encoding="utf-8")
+        write_report(say(findings, dropped), staging, has_pdf)
 
 
 def sound_settings(subsets: Subsets) -> tuple[Subsets, list[str]]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from studies.commission.spec import MeasuredSpec
 from studies.engine.fast_motion import LEAST_STEPS
 from studies.fitting.spec import number_unit
 from studies.publish import shown
@@ -19,6 +20,7 @@ class CommissionFindings(Labelled, command="commission"):
     """`commission.json`, by `studies commission`: whether there is firmware, and why not."""
 
     out: Path = unwritten()
+    measured: MeasuredSpec = unwritten()  # what was asked for
     title: str = told("of the study")
     last_stage: str = told("fit, tune, certificate or firmware", default="")
     refusals: tuple[str, ...] = told("why there is no firmware to use", default=())

@@ -15,7 +15,7 @@ from rich.console import Console
 from studies import config
 from studies.commission.findings import CommissionFindings
 from studies.commission.machines import margins_on
-from studies.commission.report import report
+from studies.commission.say import say
 from studies.commission.spec import MeasuredSpec
 from studies.commission.stages import (
     STAGES,
@@ -41,6 +41,8 @@ from studies.errors import StudyError
 from studies.export.firmware.build import check_tools
 from studies.publish import REPORT, announce, publish, replacing
 from studies.results.document import json_text
+from studies.show.pages import write_report
+from studies.show.report import print_result
 
 DOCUMENT, MARGINS = "commission.json", "margins.npy"
 #: Modules that determine the numbers, with everything they import.
@@ -76,16 +78,15 @@ def run_commission(
         outcome = _outcome(measured, out, console)
         with publish(out) as staging:
             (staging / DOCUMENT).write_text(json_text(outcome), encoding="utf-8")
-            (staging / REPORT).write_text(report(measured, outcome), encoding="utf-8")
-    for line in outcome.summary:
-        console.print(line, soft_wrap=True)
+            write_report(report := say(outcome), staging)
+    print_result(report, console)
     announce(console, out / REPORT)
     return outcome
 
 
 def _outcome(measured: MeasuredSpec, out: Path, console: Console) -> CommissionFindings:
     """All stages, up to the first one whose answer does not support the next."""
-    outcome = CommissionFindings(out, measured.study.title)
+    outcome = CommissionFindings(out, measured, measured.study.title)
     for stage in STAGES:
         fault = _run(stage, measured, out, console)
         outcome = _judged(outcome, stage, fault, measured, console)

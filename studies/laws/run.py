@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 from threading import Event, Lock
 
@@ -25,7 +24,6 @@ from studies.engine.folder import (
 from studies.engine.progress import Phases
 from studies.engine.runs import resolved_study
 from studies.errors import field_error
-from studies.laws import plots
 from studies.laws.candidates import drive_candidates, law_candidates
 from studies.laws.document import laws_document
 from studies.laws.findings import (
@@ -39,13 +37,12 @@ from studies.laws.findings import (
 )
 from studies.laws.judging import judging_sweep, read_judged
 from studies.laws.machines import machines_of, with_noise
-from studies.laws.report import report
+from studies.laws.say import say
 from studies.laws.tuning import Budget, Tuned, make_budget, tune_candidate
-from studies.publish import REPORT, publish
+from studies.publish import publish
 from studies.results.document import json_text
 from studies.results.labelled import document
-from studies.show.figures import draw
-from studies.show.sketch import sketch
+from studies.show.pages import write_report
 from studies.space.spec import SweepSpec
 from studies.study.spec import Study
 from studies.study.template import study_template
@@ -193,7 +190,4 @@ def _write(findings: LawFindings, out: Path) -> None:
             named = controller.study.model_copy(update={"title": title})
             file.write_text(study_template(named), encoding="utf-8")
         (staging / DOCUMENT).write_text(json_text(laws_document(findings)), encoding="utf-8")
-        drawings = {"laws": plots.comparison, "grid": plots.grid}
-        draw(staging, {name: partial(plot, findings) for name, plot in drawings.items()})
-        draw(staging, {"machine": partial(sketch, findings.study)})
-        (staging / REPORT).write_text(report(findings, staging), encoding="utf-8")
+        write_report(say(findings), staging)

@@ -163,7 +163,8 @@ def write_report(report: Report, folder: Path, has_pdf: bool = False) -> None:
     Raises:
         StudyError: a file cannot be written.
     """
-    drawings = {part.name: part.draw for part in report.parts if isinstance(part, Drawing)}
+    drawn = [part for part in report.parts if isinstance(part, Drawing)]
+    drawings = {part.name: part.draw for part in drawn if part.draw}
     figures.draw(folder, drawings, has_pdf)
     (folder / REPORT).write_text(page(report, folder), encoding="utf-8")
 
@@ -175,7 +176,7 @@ def card(report: Report) -> str:
     first, *others = [*drawings, None]
     shown = others[0] if others and others[0] else first  # the first one is the machine
     image = ""
-    if shown:
+    if shown and shown.draw:
         with figures.styled():
             image = inline_image(_png(shown.draw()), shown.caption)
     return render(
@@ -249,11 +250,10 @@ def _image(folder: Path | None, name: str, caption: str) -> Markup:
     if folder is None:
         return Markup()
     name = name.removesuffix(".png")
+    file = folder / (name if name.endswith(".gif") else f"{name}.png")
     if (fault := folder / f"{name}{FAULT}").is_file():
         return Markup("<p>{}</p>").format(fault.read_text(encoding="utf-8"))
-    files = [folder / f"{name}{ending}" for ending in (".png", ".gif")]
-    file = next((file for file in files if file.is_file()), None)
-    if file is None:
+    if not file.is_file():
         raise ValueError(f"the report shows {name!r}, which is not among its images")
     return inline_image(file.read_bytes(), caption)
 

@@ -13,18 +13,18 @@ from functools import partial
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from studies.show.listing import Rows
+from studies.show.listing import Rows, print_rows
 from studies.show.sketch import CAPTION, sketch
 from studies.study.spec import Study
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure: the name of its file, what it shows, and what draws it."""
+    """A figure: the name of its file, what it shows, and what draws it; None: it is there."""
 
     name: str
     caption: str
-    draw: Callable[[], Figure]
+    draw: Callable[[], Figure] | None
 
 
 @dataclass(frozen=True)
@@ -91,3 +91,11 @@ def print_result(report: Report, console: Console) -> None:
     """Print the result, a sentence a line."""
     for text in report.result:
         console.print(text.replace("**", ""), soft_wrap=True)
+
+
+def print_report(report: Report, console: Console) -> None:
+    """Print the tables, and then the result."""
+    for part in report.parts:
+        if isinstance(part, Rows):
+            print_rows(part, console)
+    print_result(report, console)

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from studies.config import start
 from studies.results.document import AsJson, print_document
-
-if TYPE_CHECKING:
-    from studies.twin.result import TwinResult
 
 
 def add_commands(app: typer.Typer, console: Console) -> None:
@@ -44,32 +40,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         loaded = load_design(design, case)
         quiet = Console(quiet=True) if as_json else console
         result = twin_design(loaded, out, quiet)
+        from studies.show.report import print_report
+        from studies.twin.say import say, twin_document
+
         if as_json:
-            from studies.twin.report import twin_document
-
             print_document(twin_document(result))
-            return
-        _print_twin(result, console)
-
-
-def _print_twin(result: TwinResult, console: Console) -> None:
-    from studies.twin.report import (
-        CAUSE_HEAD,
-        GAP_HEAD,
-        POLE_HEAD,
-        cause_rows,
-        gap_rows,
-        pole_rows,
-        verdict,
-    )
-
-    for head, rows in (
-        (GAP_HEAD, gap_rows(result)),
-        (CAUSE_HEAD, cause_rows(result.causes)),
-        (POLE_HEAD, pole_rows(result)),
-    ):
-        table = Table(*head)
-        for row in rows:
-            table.add_row(*row)
-        console.print(table)
-    console.print(verdict(result), soft_wrap=True)
+        else:
+            print_report(say(result), console)

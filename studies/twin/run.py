@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -12,15 +11,14 @@ from studies.engine.progress import Phases
 from studies.engine.runs import resolved_study
 from studies.publish import REPORT, announce, check_folder, publish
 from studies.results.document import json_text
-from studies.show.figures import draw
+from studies.show.pages import write_report
 from studies.study.spec import Study
 from studies.twin.compare import BothRuns, TwinBench, causes, check_supported, our_runs, pair
 from studies.twin.law import check_compiler
 from studies.twin.margin import first_modes, margin_by_growth, ring
 from studies.twin.multibody import DEFAULT, Settings, load_exudyn
-from studies.twin.plots import side_by_side
-from studies.twin.report import report, twin_document
-from studies.twin.result import FIGURE, TwinResult, expected_poles
+from studies.twin.result import TwinResult, expected_poles
+from studies.twin.say import say, twin_document
 
 DOCUMENT = "twin.json"
 PHASES = ("ours", "theirs", "changes", "poles", "draw")
@@ -97,5 +95,4 @@ def twin_design(
 def _write(out: Path, result: TwinResult) -> None:
     with publish(out) as staging:
         (staging / DOCUMENT).write_text(json_text(twin_document(result)), encoding="utf-8")
-        draw(staging, {FIGURE: partial(side_by_side, result.plan, result.runs)})
-        (staging / REPORT).write_text(report(result, staging), encoding="utf-8")
+        write_report(say(result), staging)

@@ -27,7 +27,7 @@ from studies.atlas import (
     workspace,
 )
 from studies.atlas.platform import LINK_SETS, platform_error, responses
-from studies.atlas.report import _runs
+from studies.atlas.say import _errors
 from studies.engine.modes import machine_modes
 from studies.engine.results import read_sweep
 from studies.engine.runs import run_study
@@ -180,11 +180,11 @@ def test_atlas_writes_what_its_report_shows(atlas):
     assert text.startswith("# Coupling atlas")
     for name in ("subsets.png", "modes.png", figures.ANIMATION, run.DATA):
         assert (folder / name).stat().st_size > 1000
-    for name in figures.FIGURES:
-        assert f"![{name}]" in text
+    drawn = list(figures.FIGURES)[:-2]  # without those of subsets of modes
+    assert all(f"![{name}]" in text for name in drawn)
     assert "nan" not in text.lower()
     page = Page((folder / "report.html").read_text(encoding="utf-8"))
-    assert len(page.images) == len(figures.FIGURES) + len(figures.MODE_FIGURES) + 2
+    assert len(page.images) == len(drawn) + 2
     assert page.title == "Coupling atlas"
     with Image.open(folder / figures.ANIMATION) as film:
         assert film.n_frames == 4
@@ -334,12 +334,12 @@ def test_a_report_says_what_control_of_all_links_changes():
         pose=vibration,
         modal=vibration[..., None],
     )
-    found = _runs(mock.Mock(platform=runs))
-    assert [(x["centre"], x["turn"]) for x in found] == [
-        ("-20.0 %", "-30.0 %"),
-        ("+10.0 %", "0.0 %"),
+    texts = _errors(mock.Mock(platform=runs)).parts[2].texts
+    assert [text.rpartition(" by ")[2] for text in texts] == [
+        "-20.0 % (φ: -30.0 %)",
+        "+10.0 % (φ: 0.0 %)",
     ]
-    assert [x["is_drive"] for x in found] == [False, True]
+    assert ["the drive error is the larger" in text for text in texts] == [False, True]
 
 
 @pytest.mark.parametrize(

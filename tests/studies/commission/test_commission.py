@@ -331,7 +331,7 @@ def test_missing_tools_are_found_before_the_fit(monkeypatch, tmp_path):
 
 def test_what_the_data_leave_open_is_said():
     fit = FIT | {"messages": ["Two links can be exchanged."]}
-    lines = CommissionFindings(None, "", fit=fit).summary
+    lines = CommissionFindings(None, None, "", fit=fit).summary
     assert "Left open by the data: Two links can be exchanged." in lines
     assert lines[-1].startswith("To measure next: hammer 2")
 

@@ -46,7 +46,7 @@ from studies.laws.judging import (
 )
 from studies.laws.machines import machines_of, spread_of, with_noise
 from studies.laws.ranking import rank
-from studies.laws.report import HEADS, table_rows
+from studies.laws.say import say
 from studies.laws.tuning import (
     Budget,
     Quality,
@@ -393,8 +393,8 @@ def test_a_verdict_is_checked_by_every_other_figure():
 def test_the_rms_voltage_is_that_of_each_actuator():
     """Three on each of three links, at 2 V all the time."""
     energy = 9 * 2.0**2 * longer(STUDY).run.duration
-    (row,) = table_rows(made_up([[2.0, 2.0]], energy))
-    assert row[HEADS.index("rms voltage, mean [V]")] == "2"
+    table = say(made_up([[2.0, 2.0]], energy)).chapters[0].parts[0]
+    assert table.rows[0][table.heads.index("rms voltage, mean [V]")] == "2"
 
 
 def tuned(candidate, study):

@@ -28,7 +28,7 @@ from studies.reference.tables import frequencies
 from studies.results.document import json_text
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study
-from studies.twin import compare, margin, plan, report
+from studies.twin import compare, margin, plan, say
 from studies.twin import run as twin_run
 from studies.twin.chain import close_chain
 from studies.twin.electronics import SensorFilter
@@ -408,7 +408,7 @@ def test_each_quantity_has_a_row_for_each_link_and_one_for_all():
     )
     plan = SimpleNamespace(rho=np.zeros((4, 3)), pose=np.zeros(3))
     result = SimpleNamespace(plan=plan, runs=runs, window=slice(1, 4))
-    rows = {name: cells for name, *cells in report.gap_rows(result)}
+    rows = {name: cells for name, *cells in say.gap_rows(result)}
     bent = "mid-span deflection, "
     assert rows[f"{bent}link 2, without control"] == ["4 µm", "8 µm", "4 µm", "50 %"]
     assert rows[f"{bent}link 2, with control"] == ["40 µm", "80 µm", "40 µm", "50 %"]
@@ -504,7 +504,7 @@ def test_the_command_writes_report_figure_and_numbers(tmp_path, capsys, monkeypa
     result = twin_design(design, tmp_path, settings=settings, has_changes=False)
     document = json.loads((tmp_path / "twin.json").read_text())
     jsonschema.validate(document, schema("twin"))
-    assert document == json.loads(json_text(report.twin_document(result)))
+    assert document == json.loads(json_text(say.twin_document(result)))
     assert document["growth"]["is_confirmed"]
     assert document["growth"]["margin"] == pytest.approx(3.70, rel=0.01)
     ours, theirs = (document[name] for name in ("damping_ratio", "twin_damping_ratio"))

@@ -1,20 +1,22 @@
-"""Tables, JSON document and page of a twin."""
+"""What a twin tells: tables, document and page."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from studies.results.labelled import Labelled, labelled, told
-from studies.show.pages import old_page as page
+from studies.show.listing import Rows
+from studies.show.report import Drawing, Report, chapter
 from studies.show.words import control_text, motion_text
 from studies.study.margin import margin_text
 from studies.study.spec import Study
 from studies.twin.compare import BothModels, ChangedRun, Gap, deflection, gap, place, turn, voltage
 from studies.twin.margin import GrowthMargin
+from studies.twin.plots import side_by_side
 from studies.twin.result import FIGURE, TwinResult
 
 GAP_HEAD = ("after the motion, rms", "this model", "twin", "difference", "of the twin's")
@@ -186,33 +188,62 @@ def twin_document(result: TwinResult) -> TwinDocument:
     )
 
 
-def report(result: TwinResult, images: Path | None = None) -> str:
-    """The page of a twin.
-
-    Args:
-        result: from `twin_design`.
-        images: folder with the figure; None: a page without.
-    """
-    electronics, period = result.study.electronics, result.plan.electronics.period
-    rounding = electronics.adc_step / electronics.conditioner_gain
-    return page(
-        "twin/report.html",
-        images,
-        result.study,
-        study=result.study,
-        verdict=verdict(result),
-        motion=motion_text(result.study),
-        control=control_text(result.study),
-        version=result.version,
-        settings=result.settings,
-        step=period / result.plan.n_steps,
-        figure_file=f"{FIGURE}.png",
-        gap_head=GAP_HEAD,
-        gaps=gap_rows(result),
-        cause_head=CAUSE_HEAD,
-        causes=cause_rows(result.causes),
-        pole_head=POLE_HEAD,
-        poles=pole_rows(result),
-        growth=result.growth,
-        rounding=rounding,
+def say(result: TwinResult) -> Report:
+    """What a twin tells."""
+    study, growth = result.study, result.growth
+    rounding = study.electronics.adc_step / study.electronics.conditioner_gain
+    step = result.plan.electronics.period / result.plan.n_steps
+    at = "" if np.isnan(growth.frequency) else f" at {growth.frequency:.4g} Hz"
+    causes = cause_rows(result.causes)
+    return Report(
+        title=f"{study.title or 'untitled study'}: twin",
+        result=[verdict(result)],
+        question=f"""{motion_text(study)}; {control_text(study)}: does the loop do the same where
+        somebody else's code is the machine, and the exported C code the controller?""",
+        next_steps="""if the differences below are small beside what you decide by, carry on:
+        `studies spillover DESIGN --out DIR` certifies the controller on machines that differ from
+        its model. If not, the second table says which assumption they come from.""",
+        top=[],
+        chapters=[
+            chapter(
+                "Side by side",
+                Drawing(
+                    FIGURE,
+                    """Both models around the end of the reference trajectory (dotted): mid-span
+                    deflection of the links from the chord between their ends, distance of the
+                    platform from the reference trajectory, difference of the deflections, and the
+                    actuator with the largest voltages""",
+                    partial(side_by_side, result.plan, result.runs),
+                ),
+                Rows(list(GAP_HEAD), gap_rows(result)),
+                f"""One step of the ADC is {rounding:.3g} V of a sensor. Where signals come near it,
+                the rounding of the two loops differs, and percentages mean little.""",
+            ),
+            chapter(
+                "What the difference is made of",
+                """Differences over the twin's rms, all links together, with one thing changed at a
+                time."""
+                if causes
+                else "",
+                Rows(list(CAUSE_HEAD), causes),
+            ),
+            chapter(
+                "Damping and gain margin",
+                f"""The twin rests, gets a pulse of small voltages and rings; poles are those of its
+                recorded sensors. Beyond the margin, a factor on `control.gain_factor`, its signals
+                grow{at}.""",
+                Rows(list(POLE_HEAD), pole_rows(result)),
+            ),
+            chapter(
+                "The twin",
+                f"""{result.version}: each link consists of {result.settings.n_elements} elements or
+                more (ANCF cables: large rotations, bending, stretch), with nodes at the ends of
+                patches and at mid-span. Patches are pairs of moments, sensors differences of slope.
+                Structural damping has the study's ratios in every mode of a link between pinned
+                ends. Steps of {1e6 * step:.3g} µs, half of that for poles and margin, generalised
+                alpha. The analogue filters are stepped exactly, the controller is the C code of
+                `studies export --target c`, called once per sample.""",
+            ),
+        ],
+        files={"Study file": study},
     )
