@@ -7,14 +7,12 @@ from the run and from nothing else.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import NamedTuple
-
-from matplotlib.figure import Figure
 
 from studies.engine.batches import ProgressCallback
 from studies.results.labelled import Labelled, Variable, told
 from studies.show.listing import Rows
+from studies.show.report import Report
 from studies.study.spec import Study
 
 HOLDS, FAILS = "holds", "fails"
@@ -64,8 +62,7 @@ class CardResult(NamedTuple):
     study: Study  # baseline
     verdicts: list[Verdict]  # of the card's claims, in their order
     tables: dict[str, Rows]  # by name of their CSV file
-    figures: dict[str, Callable[[], Figure]]  # by file name, of which the page shows all
-    page: Callable[[Path], str]  # report, from the folder of the figures
+    report: Report
     # runs by name of their HDF5 file: their study and variables
     stores: Mapping[str, tuple[Study, dict[str, Variable]]] = {}
 

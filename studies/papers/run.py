@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -17,15 +16,14 @@ from studies.papers.card import CardResult, PaperCard, PaperOutcome
 from studies.papers.catalogue import find_card
 from studies.publish import REPORT, announce, check_folder, publish
 from studies.results.document import json_text
-from studies.show.figures import draw
 from studies.show.listing import Rows
-from studies.show.sketch import sketch
+from studies.show.pages import write_report
 from studies.store import write_store
 
 #: File of the outcomes.
 CLAIMS = "claims.json"
-#: Share of the work that a figure takes, in units of `PaperCard.work`.
-DRAWING = 0.25
+#: Share of the work that the figures take, in units of `PaperCard.work`.
+DRAWING = 4.0
 
 
 def run_paper(
@@ -59,7 +57,7 @@ def run_card(card: PaperCard, out: Path, console: Console, has_pdf: bool = False
             progress.update(task, description=text, advance=share)
 
         result = card.run(on_progress)
-        progress.update(task, total=card.work + 1 + DRAWING * len(result.figures))
+        progress.update(task, total=card.work + 1 + DRAWING)
         _write(card, result, out, on_progress, has_pdf)
         progress.update(task, description="done")
     _print_outcome(result, out, console)
@@ -77,11 +75,9 @@ def _write(
             _write_csv(staging / f"{name}.csv", rows)
         (staging / CLAIMS).write_text(json_text(_document(card, result)), "utf-8")
         on_progress("writing data", 1.0)
-        for name, drawing in result.figures.items():
-            on_progress(f"drawing {name}", DRAWING)
-            draw(staging, {name: drawing}, has_pdf)
-        draw(staging, {"machine": partial(sketch, result.study)})
-        (staging / REPORT).write_text(result.page(staging), encoding="utf-8")
+        on_progress("drawing", 0.0)
+        write_report(result.report, staging, has_pdf)
+        on_progress("drawing", DRAWING)
 
 
 def _write_csv(path: Path, rows: Rows) -> None:

@@ -5,9 +5,6 @@ One machine is fitted to the measurements, the other is the nominal one.
 
 from __future__ import annotations
 
-from functools import partial
-from pathlib import Path
-
 import numpy as np
 
 from studies.engine.batches import ProgressCallback
@@ -16,9 +13,8 @@ from studies.papers.zhang_2016 import tables
 from studies.papers.zhang_2016.cases import PaperCase, fitted_study, paper_cases, run_cases, work_of
 from studies.papers.zhang_2016.claims import CLAIMS, LEFT_OPEN, judge
 from studies.papers.zhang_2016.context import Context, Machines
-from studies.papers.zhang_2016.figures import PAPER_FIGURES
 from studies.papers.zhang_2016.measures import measure
-from studies.papers.zhang_2016.report import report
+from studies.papers.zhang_2016.say import say
 from studies.papers.zhang_2016.store import paper_variables
 from studies.show.listing import Rows
 from studies.study.labels import describe
@@ -51,16 +47,11 @@ def evaluate(
 def result_of(machines: Machines) -> CardResult:
     """What the card writes of its runs."""
     verdicts = judge(machines)
-
-    def page(folder: Path) -> str:
-        return report(CARD, verdicts, machines, folder)
-
     return CardResult(
         study=machines.nominal.runs.study,
         verdicts=verdicts,
         tables=_tables(machines),
-        figures={name: partial(draw, machines) for name, draw in PAPER_FIGURES.items()},
-        page=page,
+        report=say(CARD, verdicts, machines),
         stores={
             name: (context.runs.study, paper_variables(context.runs, context.measures))
             for name, context in zip(Machines._fields, machines, strict=True)

@@ -218,21 +218,39 @@ def _shapers(machines: Machines) -> Figure:
 
 
 #: Figures by file name; captions are in `report.html`.
-PAPER_FIGURES: dict[str, Callable[[Machines], Figure]] = {
-    "fig03": partial(_deflection, links=ALL, is_whole=True),
-    "fig04": _modes,
-    "fig05": partial(_pose, links=ALL, delay=None),
-    "fig06": partial(_pose, links=ALL),
-    "fig07": partial(_deflection, links=ONE),
-    "fig08": partial(_pose, links=ONE),
-    "fig09": partial(_deflection, links=TWO),
-    "fig10": partial(_pose, links=TWO),
-    "fig12": _sensor,
-    "fig13": partial(_spectra, mode=1, links=None),
-    "fig14": partial(_spectra, mode=1, links=ALL),
-    "fig15": partial(_spectra, mode=2, links=None),
-    "fig16": partial(_spectra, mode=2, links=ALL),
-    "fig17": partial(_spectra, mode=1, links=ONE),
-    "fig18": partial(_spectra, mode=1, links=TWO),
-    "shapers": _shapers,
+PAPER_FIGURES: dict[str, tuple[str, Callable[[Machines], Figure]]] = {
+    "fig03": (
+        "deflection at 150 mm, three links controlled: the motion, then after the move",
+        partial(_deflection, links=ALL, is_whole=True),
+    ),
+    "fig04": ("modes 1 to 3 of link 1 after the move, three links controlled", _modes),
+    "fig05": (
+        "platform error during the motion, three links controlled",
+        partial(_pose, links=ALL, delay=None),
+    ),
+    "fig06": (
+        "platform error after the move, three links controlled",
+        partial(_pose, links=ALL),
+    ),
+    "fig07": (
+        "deflection at 150 mm after the move, link 1 controlled",
+        partial(_deflection, links=ONE),
+    ),
+    "fig08": ("platform error after the move, link 1 controlled", partial(_pose, links=ONE)),
+    "fig09": (
+        "deflection at 150 mm after the move, links 1, 2 controlled",
+        partial(_deflection, links=TWO),
+    ),
+    "fig10": ("platform error after the move, links 1, 2 controlled", partial(_pose, links=TWO)),
+    "fig12": ("sensor voltage at 150 mm after the move, two modes controlled", _sensor),
+    "fig13": ("PSD of mode 1 without control", partial(_spectra, mode=1, links=None)),
+    "fig14": ("PSD of mode 1, three links controlled", partial(_spectra, mode=1, links=ALL)),
+    "fig15": ("PSD of mode 2 without control", partial(_spectra, mode=2, links=None)),
+    "fig16": ("PSD of mode 2, three links controlled", partial(_spectra, mode=2, links=ALL)),
+    "fig17": ("PSD of mode 1, link 1 controlled", partial(_spectra, mode=1, links=ONE)),
+    "fig18": ("PSD of mode 1, links 1, 2 controlled", partial(_spectra, mode=1, links=TWO)),
+    "shapers": (
+        "input shapers: sensitivity, and residual vibration with EI, nominal machine",
+        _shapers,
+    ),
 }

@@ -4,7 +4,6 @@ import csv
 import io
 import json
 import re
-from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
 from unittest import mock
@@ -25,7 +24,7 @@ from studies.errors import StudyError
 from studies.papers import run as papers
 from studies.papers.zhang_2016 import card as paper
 from studies.papers.zhang_2016 import cases as paper_cases
-from studies.papers.zhang_2016 import claims, report, tables
+from studies.papers.zhang_2016 import claims, say, tables
 from studies.papers.zhang_2016 import context as report_context
 from studies.papers.zhang_2016 import figures as paper_figures
 from studies.papers.zhang_2016.cases import ALL, MOVES, OFF, ONE, SHAPERS, TWO, run_cases
@@ -33,6 +32,7 @@ from studies.papers.zhang_2016.claims import CLAIMS, LEFT_OPEN
 from studies.papers.zhang_2016.context import Context, Machines
 from studies.papers.zhang_2016.measures import measure
 from studies.show.figures import comparison
+from studies.show.report import Drawing
 from studies.show.units import span
 from studies.store import read_store
 from studies.study.labels import describe
@@ -91,8 +91,7 @@ def short(tmp_path_factory):
     few = {name: paper_figures.PAPER_FIGURES[name] for name in FIGURES}
     with (  # what is replaced is part of no program: they are kept
         mock.patch.object(paper_cases, "JUDGED", ()),
-        mock.patch.object(paper, "PAPER_FIGURES", few),
-        mock.patch.object(report, "PAPER_FIGURES", few),
+        mock.patch.object(say, "PAPER_FIGURES", few),
     ):
         machines = paper.evaluate(other_machine(), short_study(), cases, lambda *_: None)
         papers.run_card(card_of(machines), folder, console)
@@ -320,14 +319,15 @@ def test_settling_times_of_the_result_are_those_of_its_table(short):
     settling = 1e-3 * np.arange(fitted.measures.settling.size).reshape(-1, 3)
     made_up = fitted._replace(measures=fitted.measures._replace(settling=settling))
     off, on = tables.settling_rows(Machines(made_up, made_up))[:2]
-    result = report._agreement(made_up)
+    result = say._agreement(made_up)
     for row, times in ((off, result["free"]), (on, result["held"])):
         assert row[2] == ", ".join(f"{time:.0f}" for time in times)
 
 
-def test_every_figure_stands_beside_its_table():
-    text = Path(report.__file__).with_suffix(".html").read_text(encoding="utf-8")
-    assert sorted(re.findall(r'counterpart\("(\w+)"', text)) == sorted(paper_figures.PAPER_FIGURES)
+def test_every_figure_stands_beside_its_table(short):
+    report = paper.result_of(short.machines).report
+    drawn = [part.name for part in report.parts if isinstance(part, Drawing)]
+    assert sorted(drawn) == sorted(["machine", *paper_figures.PAPER_FIGURES])
 
 
 def test_table_1_percentages_are_the_papers():
@@ -344,7 +344,7 @@ def test_formatting():
 
 
 def test_every_figure_has_units_on_its_axes(short):
-    for draw in paper_figures.PAPER_FIGURES.values():
+    for _, draw in paper_figures.PAPER_FIGURES.values():
         drawn = draw(short.machines)
         assert all(ax.has_data() for ax in drawn.axes)
         labels = [ax.get_xlabel() for ax in drawn.axes if ax.get_xlabel()]
@@ -382,7 +382,7 @@ def test_failure_while_writing_leaves_old_files_whole(short, tmp_path, monkeypat
     def fail(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr(papers, "draw", fail)
+    monkeypatch.setattr(papers, "write_report", fail)
     with pytest.raises(StudyError, match="disk full"):
         papers.run_card(card_of(short.machines), tmp_path, Console(quiet=True))
     assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
