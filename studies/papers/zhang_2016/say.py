@@ -45,9 +45,7 @@ from studies.study.window import residual_delay
 def say(card: PaperCard, verdicts: list[Verdict], machines: Machines) -> Report:
     """What the study tells; verdicts: on the claims of the card."""
     study = machines.nominal.runs.study
-    claims = Rows(
-        ["claim", "quantity", "condition", "outcome", "found"], [x.cells for x in verdicts]
-    )
+    heads = ["claim", "quantity", "condition", "outcome", "found"]
     return Report(
         title="The paper's study: its numbers and ours",
         result=_result(machines),
@@ -58,7 +56,7 @@ def say(card: PaperCard, verdicts: list[Verdict], machines: Machines) -> Report:
         placement` and `studies tune tune` for better designs than the paper's.""",
         top=[machine(study)],
         chapters=[
-            chapter("Claims", claims),
+            chapter("Claims", Rows(heads, [x.cells for x in verdicts])),
             chapter(
                 "What the paper leaves open",
                 f"Source: {card.source}. {card.read}",
@@ -79,12 +77,9 @@ def say(card: PaperCard, verdicts: list[Verdict], machines: Machines) -> Report:
 
 def _beside(machines: Machines, *names: str) -> list[Drawing]:
     """Counterparts of figures of the paper."""
+    drawn = [(name, *PAPER_FIGURES[name]) for name in names if name in PAPER_FIGURES]
     return [
-        Drawing(
-            name, f"`{name}`: {PAPER_FIGURES[name][0]}", partial(PAPER_FIGURES[name][1], machines)
-        )
-        for name in names
-        if name in PAPER_FIGURES
+        Drawing(name, f"`{name}`: {text}", partial(draw, machines)) for name, text, draw in drawn
     ]
 
 
@@ -134,15 +129,15 @@ def _machines(machines: Machines) -> Chapter | None:
     return chapter(
         "The machines and their runs",
         Rows(["", "fitted machine", "nominal machine"], machine_rows(machines)),
-        f"""Control: sampled at {electronics.sample_rate_hz / 1e3:g} kHz, {electronics.adc_bits} bit,
-        one sample of delay, velocity by {electronics.estimator}. Cases: no control, three links,
-        the first two, the first only; three controlled modes (the paper's section 4) and two
-        (section 5, ratios (27); the comparison cases control mode 1 only). On the nominal machine
-        one ADC step is {span(steps[1])} µm of mode 1, on the fitted one {span(steps[0])} µm: a
-        residual below it is told as "<". {"Failed or unstable:" if bad else "All runs ended ok."}""",
+        f"""Control: sampled at {electronics.sample_rate_hz / 1e3:g} kHz, {electronics.adc_bits}
+        bit, one sample of delay, velocity by {electronics.estimator}. Cases: no control, three
+        links, the first two, the first only; three controlled modes (the paper's section 4) and two
+        (section 5, ratios (27); the comparison cases control mode 1 only). One ADC step is
+        {span(steps[1])} µm of mode 1 on the nominal machine, {span(steps[0])} µm on the fitted one:
+        a residual below it is told as "<". {"Failed or unstable:" if bad else "All ended ok."}""",
         Items(bad),
-        f"""Residual window: {number(study.metrics.residual_length, "s")} ms, from the moment on when
-        the slider drive has settled to 2 % ({_delays(machines)} ms after the reference trajectory).
+        f"""Residual window: {number(study.metrics.residual_length, "s")} ms, from when the slider
+        drive has settled to 2 % ({_delays(machines)} ms after the reference trajectory).
         `fig03` is the counterpart of the paper's figure 3, and so on; left column: the fitted
         machine, right column: the nominal one, both on the compared motion.""",
         Rows(list(COLUMNS), frequency_rows(machines)),
@@ -222,7 +217,7 @@ def _moves(nominal: Context) -> Chapter | None:
     heads = ["", "bending while moving [µm]", "residual rms [µm]", band]
     return chapter(
         "Nominal machine: moves and shapers",
-        f"The paper's section 4 has the move of {MOVES['paper']:.4g} s; three modes, links 1, 2, 3.",
+        f"The paper's section 4 has the move of {MOVES['paper']:.4g} s; three modes, three links.",
         Rows([*heads, f"to {100 * SETTLED:g} % [ms]"], motion_rows(nominal)),
         *_beside(Machines(nominal, nominal), "shapers"),
     )

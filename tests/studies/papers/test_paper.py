@@ -130,7 +130,7 @@ def test_outcome_of_every_claim_is_printed_and_kept(short):
     page = text_of((short.folder / "report.html").read_text(encoding="utf-8"))
     for claim in found["claims"]:
         assert claim["found"] in page
-    assert found["left_open"] == list(LEFT_OPEN) and all(one in page for one in LEFT_OPEN)
+    assert found["left_open"] == list(LEFT_OPEN) and all(x[1:] in page for x in LEFT_OPEN)
     assert "report.html" in short.printed and "fitted.h5" in short.printed
 
 
