@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import combinations
 from pathlib import Path
 
@@ -39,7 +38,8 @@ _ERRORS = ("x [nm]", "y [nm]", "φ [nrad]")
 _COLUMNS = ["link 1", "link 2", "link 3", "platform"]
 
 
-def _subsets(findings: AtlasFindings) -> Figure:
+def subsets(findings: AtlasFindings) -> Figure:
+    """Change of the residual of links and platform, by controlled links."""
     figure, axes = _panels(findings, findings.links, 2.2)
     rows = [link_label(k) for k in CHOICES[1:]]
     for ax, change in zip(axes, _link_changes(findings), strict=True):
@@ -71,7 +71,8 @@ def _panels(findings: AtlasFindings, subsets: Subsets, height: float) -> tuple[F
     return figure, axes.ravel()[:count]
 
 
-def _lattice(findings: AtlasFindings) -> Figure:
+def lattice(findings: AtlasFindings) -> Figure:
+    """Residual of all links, one more controlled link per step; dashed: it increases."""
     figure, axes = _panels(findings, findings.links, 1.9)
     every = np.sqrt(np.mean(findings.links.link**2, axis=-1))
     for ax, residual in zip(axes, every, strict=True):
@@ -79,7 +80,8 @@ def _lattice(findings: AtlasFindings) -> Figure:
     return figure
 
 
-def _effects(findings: AtlasFindings) -> Figure:
+def helps(findings: AtlasFindings) -> Figure:
+    """Who helps or hurts whom: one link controlled."""
     figure, axes = _panels(findings, findings.links, 1.5)
     for ax, change in zip(axes, _link_changes(findings), strict=True):
         image = plots.change_map(effects(1 + change), _COLUMNS[:3], _COLUMNS, ax)
@@ -91,8 +93,11 @@ def _effects(findings: AtlasFindings) -> Figure:
     return figure
 
 
-def _shares(findings: AtlasFindings) -> Figure:
-    """Shares of the links, and interactions of pairs of them."""
+def shares(findings: AtlasFindings) -> Figure:
+    """Links: Shapley shares in what control of all removes [% of the mean square].
+
+    Below, interactions: what two links remove together beyond what each removes.
+    """
     game = findings.links.removed()
     pairs = list(combinations(range(3), 2))
     index = interaction(game)
@@ -105,7 +110,8 @@ def _shares(findings: AtlasFindings) -> Figure:
     return figure
 
 
-def _mode_shares(findings: AtlasFindings) -> Figure:
+def mode_shares(findings: AtlasFindings) -> Figure:
+    """Shapley shares of links and modes in what control removes [% of the mean square]."""
     subsets = _modes_of(findings)
     labels, modes = findings.labels(subsets), [str(j + 1) for j in range(subsets.modes)]
     share = shapley(subsets.removed()).reshape(-1, len(TARGETS), 3, subsets.modes)
@@ -122,7 +128,8 @@ def _mode_shares(findings: AtlasFindings) -> Figure:
     return figure
 
 
-def _interactions(findings: AtlasFindings) -> Figure:
+def interactions(findings: AtlasFindings) -> Figure:
+    """Pairs of links and modes that remove more or less together; 2.1: mode 1 of link 2."""
     subsets = _modes_of(findings)
     figure, axes = _panels(findings, subsets, 2.4)
     every = interaction(subsets.removed()[:, TARGETS.index("all links")])
@@ -144,7 +151,11 @@ def _modes_of(findings: AtlasFindings) -> Subsets:
     return findings.subsets
 
 
-def _workspace(findings: AtlasFindings) -> Figure:
+def workspace(findings: AtlasFindings) -> Figure:
+    """Natural modes over the workspace.
+
+    Orange: singular border, white: distance of the nearest link angle from it, black: the path.
+    """
     chart = findings.map
     figure, axes = new_figure(3, len(chart.phi), 1.8, False)
     rows = (
@@ -168,8 +179,8 @@ def _workspace(findings: AtlasFindings) -> Figure:
     return figure
 
 
-def _participation(findings: AtlasFindings) -> Figure:
-    """Participation of the links in the first three bending modes, over the workspace."""
+def participation(findings: AtlasFindings) -> Figure:
+    """Participation of the links in the first three bending modes."""
     chart = findings.map
     middle = len(chart.phi) // 2
     figure, axes = new_figure(3, 3, 1.8, False)
@@ -190,7 +201,8 @@ def _participation(findings: AtlasFindings) -> Figure:
     return figure
 
 
-def _modes(findings: AtlasFindings) -> Figure:
+def modes(findings: AtlasFindings) -> Figure:
+    """Natural modes, deflections exaggerated, and the links' shares of the strain energy."""
     figure, axes = new_figure(3, 3, 2.2, False)
     home, far = findings.poses
     first = np.sort(np.argsort(-findings.modes.order_share[:, :, 0], axis=1)[:, :3], axis=1)
@@ -217,8 +229,8 @@ def _modes(findings: AtlasFindings) -> Figure:
     return figure
 
 
-def _platform(findings: AtlasFindings) -> Figure:
-    """Drive error above, what the bending of the links adds below."""
+def platform(findings: AtlasFindings) -> Figure:
+    """Platform error: due to the drive, and added by the bending of the links."""
     runs = findings.platform
     figure, axes = new_figure(4, len(RUNS), 1.7)
     for column, setting in enumerate(RUNS):
@@ -243,8 +255,8 @@ def _platform(findings: AtlasFindings) -> Figure:
     return figure
 
 
-def _vibration_after(findings: AtlasFindings) -> Figure:
-    """Vibration error after the command, for the paper's choices of links."""
+def vibration(findings: AtlasFindings) -> Figure:
+    """Vibration error of the platform after the reference trajectory."""
     runs = findings.platform
     figure, axes = new_figure(3, len(RUNS), 1.9)
     for column, setting in enumerate(RUNS):
@@ -268,7 +280,8 @@ def _vibration_after(findings: AtlasFindings) -> Figure:
     return figure
 
 
-def _responses(findings: AtlasFindings) -> Figure:
+def responses(findings: AtlasFindings) -> Figure:
+    """Frequency responses of the sampled loop."""
     size = np.abs(findings.responses.value)
     figure, axes = new_figure(2, 2, 2.3)
     shown = (
@@ -284,23 +297,6 @@ def _responses(findings: AtlasFindings) -> Figure:
         ax.set_xlabel("frequency [Hz]")
     legend_above(figure, axes[0, 0])
     return figure
-
-
-#: What draws each figure, by its name; the last two need subsets of modes.
-FIGURES: dict[str, Callable[[AtlasFindings], Figure]] = {
-    "subsets": _subsets,
-    "helps": _effects,
-    "lattice": _lattice,
-    "shares": _shares,
-    "workspace": _workspace,
-    "participation": _participation,
-    "modes": _modes,
-    "platform": _platform,
-    "vibration": _vibration_after,
-    "responses": _responses,
-    "mode_shares": _mode_shares,
-    "interactions": _interactions,
-}
 
 
 def write_animation(findings: AtlasFindings, folder: Path) -> None:

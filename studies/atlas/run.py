@@ -14,7 +14,7 @@ from rich.console import Console
 from jaxmodel import status
 from studies import config
 from studies.atlas.attribution import interaction, shapley
-from studies.atlas.figures import FIGURES, write_animation
+from studies.atlas.figures import write_animation
 from studies.atlas.findings import AtlasFindings, adc_step, evaluate_atlas
 from studies.atlas.say import say
 from studies.atlas.subsets import (
@@ -46,6 +46,8 @@ from studies.sweeps.run import run_sweep, sweep_phases
 from studies.threads import serial_blas
 
 DATA, RUNS_FOLDER, MODES_FOLDER = "atlas.h5", ATLASES.mark, "runs_modes"
+#: Figures of subsets of modes.
+OF_MODES = "mode_shares", "interactions"
 #: Phases after those of the sweep.
 LATER = ("analyse", "draw")
 
@@ -136,7 +138,7 @@ def _finish(
     with serial_blas():
         findings = evaluate_atlas(study, *found, on_progress)
     phases.begin("draw")
-    with publish(out, [f"{x}.{kind}" for x in FIGURES for kind in ("png", "pdf")]) as staging:
+    with publish(out, [f"{x}.{kind}" for x in OF_MODES for kind in ("png", "pdf")]) as staging:
         write_store(staging / DATA, atlas_variables(findings), run_attributes(study))
         write_animation(findings, staging)
         write_report(say(findings, dropped), staging, has_pdf)

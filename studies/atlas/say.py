@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from functools import partial
 
 import numpy as np
 
+from studies.atlas import figures
 from studies.atlas.attribution import shapley
 from studies.atlas.claims import NO_CHANGE, one_more_link, table_1_signs, two_links
-from studies.atlas.figures import ANIMATION, FIGURES
 from studies.atlas.findings import AtlasFindings
 from studies.atlas.platform import LINK_LABELS, OUTPUTS
 from studies.atlas.platform import SETTINGS as RUNS
@@ -17,7 +16,7 @@ from studies.atlas.plots import length_text
 from studies.atlas.subsets import CHOICES, MATTERS, TARGETS, link_label, setting_label
 from studies.atlas.workspace import MAP_MODES, Map
 from studies.show.listing import Rows
-from studies.show.report import Chapter, Drawing, Items, Report, chapter, machine
+from studies.show.report import Chapter, Drawing, Items, Report, chapter, drawing, machine
 from studies.show.units import count_text, span
 from studies.study.window import residual_delay
 
@@ -64,16 +63,14 @@ def say(findings: AtlasFindings, dropped: Sequence[str] = ()) -> Report:
                 f"""The last milliseconds of the move ({setting_label(RUNS[-1])}) and the residual
                 vibration after it, slowed down by a factor of 50.""",
                 Drawing(
-                    ANIMATION, "The machine without control and with three links controlled", None
+                    figures.ANIMATION,
+                    "The machine without control and with three links controlled",
+                    None,
                 ),
             ),
         ],
         files={"Study file": study},
     )
-
-
-def _figure(findings: AtlasFindings, name: str, caption: str) -> Drawing:
-    return Drawing(name, caption, partial(FIGURES[name], findings))
 
 
 def _by_setting(findings: AtlasFindings, cells: Iterable[Iterable[str]]) -> list[list[str]]:
@@ -156,15 +153,9 @@ def _choices(findings: AtlasFindings) -> Chapter | None:
         "Which links to control",
         "Residual of all three links, rms, by controlled links:",
         Rows(["setting", *map(link_label, CHOICES)], _by_setting(findings, residuals)),
-        _figure(
-            findings, "subsets", "Change of the residual of links and platform, by controlled links"
-        ),
-        _figure(findings, "helps", "Who helps or hurts whom: one link controlled"),
-        _figure(
-            findings,
-            "lattice",
-            "Residual of all links, one more controlled link per step; dashed: it increases",
-        ),
+        drawing(figures.subsets, findings),
+        drawing(figures.helps, findings),
+        drawing(figures.lattice, findings),
     )
 
 
@@ -192,16 +183,8 @@ def _contributions(findings: AtlasFindings) -> Chapter | None:
             for label, share in zip(labels, shares, strict=True)
         ]
         drawn = [
-            _figure(
-                findings,
-                "mode_shares",
-                "Shapley shares of links and modes in what control removes [% of the mean square]",
-            ),
-            _figure(
-                findings,
-                "interactions",
-                "Pairs of links and modes that remove more or less together; 2.1: mode 1 of link 2",
-            ),
+            drawing(figures.mode_shares, findings),
+            drawing(figures.interactions, findings),
         ]
     return chapter(
         "Contributions of links",
@@ -211,12 +194,7 @@ def _contributions(findings: AtlasFindings) -> Chapter | None:
             ["setting", *links, "removed by all", "modes 2 and up change at most"],
             _by_setting(findings, cells),
         ),
-        _figure(
-            findings,
-            "shares",
-            """Links: Shapley shares in what control of all removes [% of the mean square], and
-            below interactions: what two links remove together beyond what each removes""",
-        ),
+        drawing(figures.shares, findings),
         text if modes > 1 else "",
         Rows(["setting", *links], rows),
         *drawn,
@@ -340,22 +318,9 @@ def _workspace(findings: AtlasFindings) -> Chapter | None:
         modes at {_reach(chart.bending[turn])} Hz, {_reach(100 * chart.spread[turn])} % apart; the
         coupling of two links' first modes through platform and sliders is
         {_reach(100 * chart.coupling[turn], ".2f")} %. Without damping, {passing}; {damping}.""",
-        _figure(
-            findings,
-            "workspace",
-            """Natural modes over the workspace; orange: singular border, white: distance of the
-            nearest link angle from it, black: the path""",
-        ),
-        _figure(
-            findings,
-            "participation",
-            "Participation of the links in the first three bending modes",
-        ),
-        _figure(
-            findings,
-            "modes",
-            "Natural modes, deflections exaggerated, and the links' shares of the strain energy",
-        ),
+        drawing(figures.workspace, findings),
+        drawing(figures.participation, findings),
+        drawing(figures.modes, findings),
     )
 
 
@@ -407,14 +372,8 @@ def _errors(findings: AtlasFindings) -> Chapter | None:
         paper's figures 5, 6, 8 and 10 show the sum). Rms values:""",
         Rows(["setting", "error", "centre [nm]", "φ [nrad]"], rows),
         Items(texts),
-        _figure(
-            findings,
-            "platform",
-            "Platform error: due to the drive, and added by the bending of the links",
-        ),
-        _figure(
-            findings, "vibration", "Vibration error of the platform after the reference trajectory"
-        ),
+        drawing(figures.platform, findings),
+        drawing(figures.vibration, findings),
     )
 
 
@@ -439,5 +398,5 @@ def _responses(findings: AtlasFindings) -> Chapter | None:
         links; sampled loop linearised at the path's first pose. A dash: the loop is unstable, or a
         force on the platform bends the links directly, a response that is not computed here.""",
         Rows(["from, to", *LINK_LABELS], rows),
-        _figure(findings, "responses", "Frequency responses of the sampled loop"),
+        drawing(figures.responses, findings),
     )

@@ -19,10 +19,11 @@ SHADES = ("#08306B", "#2171B5", "#6BAED6")
 
 
 def comparison(findings: LawFindings) -> Figure:
-    """Residual vibration of the best controllers on all machines, with the intervals of ratios.
+    """The best controllers.
 
-    Left: every machine and move, geometric mean marked. Right: the ratio to the best one with its
-    95 % interval, by each figure.
+    Left: residual vibration on every machine and in every move (darker: faster), the geometric mean
+    marked. Right: ratio to the best controller by each figure, with the interval that other
+    machines of the same spread could have shown.
 
     Args:
         findings: of the comparison.
@@ -73,7 +74,9 @@ def comparison(findings: LawFindings) -> Figure:
 
 
 def grid(findings: LawFindings) -> Figure:
-    """Mean residual vibration and platform error of every law (rows) with every drive (columns).
+    """Every tuned law (rows) with every tuned drive (columns).
+
+    Geometric means over all machines and moves. A dash: it does not keep the budget.
 
     Args:
         findings: of the comparison.

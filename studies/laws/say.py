@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 
 from jaxmodel import status
@@ -15,7 +13,7 @@ from studies.laws.machines import spread_of
 from studies.laws.ranking import CONFIDENCE
 from studies.laws.tuning import AGREE, LATE, Tuned
 from studies.show.listing import Rows
-from studies.show.report import Chapter, Drawing, Items, Report, chapter, machine
+from studies.show.report import Chapter, Items, Report, chapter, drawing, machine
 from studies.show.units import count_text, number
 from studies.study.margin import delay_text, margin_text
 
@@ -62,21 +60,7 @@ def say(findings: LawFindings) -> Report:
         ({budget.margin:.3g})?""",
         next_steps="""each tuned controller is a study file in this folder: `studies spillover`
         certifies it, `studies export` writes it for a real-time controller.""",
-        top=[
-            Drawing(
-                "laws",
-                """Left: residual vibration on every machine and in every move (darker: faster), the
-                geometric mean marked. Right: ratio to the best controller by each figure, with the
-                interval that other machines of the same spread could have shown.""",
-                partial(plots.comparison, findings),
-            ),
-            Drawing(
-                "grid",
-                """Every tuned law (rows) with every tuned drive (columns): geometric means over all
-                machines and moves. A dash: it does not keep the budget.""",
-                partial(plots.grid, findings),
-            ),
-        ],
+        top=[drawing(plots.comparison, findings, name="laws"), drawing(plots.grid, findings)],
         chapters=[
             *_controllers(findings),
             _tunings(findings),

@@ -6,13 +6,16 @@ between backticks and **strong** words; lines of a long one are joined.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from studies.show import figures
 from studies.show.listing import Rows, print_rows
 from studies.show.sketch import CAPTION, sketch
 from studies.study.spec import Study
@@ -72,6 +75,28 @@ def chapter(title: str, *parts: Part) -> Chapter | None:
     """A heading with what is not empty of some parts; None if all are."""
     shown = [part for part in parts if part and (part.rows if isinstance(part, Rows) else True)]
     return Chapter(title, shown) if shown else None
+
+
+def drawing(
+    draw: Callable[..., Any], *arguments: Any, name: str = "", height: float = 0.0
+) -> Drawing:
+    """A figure whose caption is what its function says of itself.
+
+    Args:
+        draw: what draws it, its last argument the axes if `height` is given.
+        arguments: of that function.
+        name: of its file; default: the function's.
+        height: [inch] of a figure with one pair of axes.
+    """
+
+    def on_axes() -> Figure:
+        figure, axes = figures.one_panel(height)
+        draw(*arguments, axes)
+        return figure
+
+    caption = (inspect.getdoc(draw) or "").partition("\n\nArgs:")[0]
+    made = on_axes if height else partial(draw, *arguments)
+    return Drawing(name or draw.__name__, caption, made)
 
 
 def machine(study: Study) -> Drawing:

@@ -33,7 +33,7 @@ def _has_departures(certificate: Certificate) -> bool:
 
 
 def margins(certificate: Certificate, ax: Axes | None = None) -> Axes:
-    """Gain margin for every mismatch: of the largest plants, and, hollow, of the smallest.
+    """Gain margin of every plant: filled of the largest ones, hollow of the smallest.
 
     Args:
         certificate: from `certify`.
@@ -158,7 +158,7 @@ def leakage_map(
 
 
 def leakage(certificate: Certificate) -> Figure:
-    """`leakage_map` for each basis: the largest of all links and mismatches."""
+    """Observation spillover: what plant modes add to the estimates, at most."""
     size = np.abs(certificate.observation)
     bases = [b for b in range(len(size)) if not np.all(np.isnan(size[b]))]
     with figures.styled():

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from jaxmodel import status
 from jaxmodel.laws import LAWS
 from studies.engine.breaking import UNITS
 from studies.engine.fast_motion import FAST, WINDOW
-from studies.show import figures
 from studies.show.listing import Rows
-from studies.show.report import Chapter, Drawing, Items, Report, chapter, machine
+from studies.show.report import Chapter, Items, Report, chapter, drawing, machine
 from studies.show.units import span
 from studies.show.words import motion_text
 from studies.spillover import plots
@@ -168,25 +162,9 @@ def _margins(certificate: Certificate, plants: int) -> Chapter | None:
         hold most of the energy of the motion; those above half the sample rate,
         {electronics.sample_rate_hz / 2:g} Hz, reach the controller folded.""",
         Rows(heads, _plant_rows(certificate)),
-        Drawing(
-            "margins",
-            "Gain margin of every plant",
-            partial(_panel, plots.margins, certificate, 3.6),
-        ),
-        Drawing(
-            "damping",
-            "Damping ratio of every link mode at the design's gains",
-            partial(_panel, plots.mode_damping, certificate, 2.65),
-        ),
+        drawing(plots.margins, certificate, height=4.35),
+        drawing(plots.mode_damping, certificate, name="damping", height=3.4),
     )
-
-
-def _panel(
-    plot: Callable[[Certificate, Axes], object], certificate: Certificate, height: float
-) -> Figure:
-    figure, axes = figures.new_figure(1, 1, height)
-    plot(certificate, axes[0, 0])
-    return figure
 
 
 def _proofs(certificate: Certificate) -> Chapter | None:
@@ -251,11 +229,7 @@ def _spillover(certificate: Certificate) -> Chapter | None:
         controlled mode excites uncontrolled ones by up to {pushed:.3g} of itself (mode
         {controlled} on mode {excited}, {other.basis}).""",
         Rows(["basis", "estimate", *(f"mode {r + 1}" for r in range(first, last))], rows),
-        Drawing(
-            "leakage",
-            "Observation spillover: what plant modes add to the estimates",
-            partial(plots.leakage, certificate),
-        ),
+        drawing(plots.leakage, certificate),
     )
 
 

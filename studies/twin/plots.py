@@ -24,7 +24,11 @@ BEFORE = 0.01
 
 
 def side_by_side(plan: TwinPlan, runs: BothRuns) -> Figure:
-    """Both models' runs around the end of the motion: without control left, with control right.
+    """Both models around the end of the reference trajectory (dotted).
+
+    Mid-span deflection of the links from the chord between their ends, distance of the platform
+    from the reference trajectory, difference of the deflections, and the actuator with the largest
+    voltages; without control left, with control right.
 
     Args:
         plan: of the motion.

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from studies.results.labelled import Labelled, labelled, told
 from studies.show.listing import Rows
-from studies.show.report import Drawing, Report, chapter
+from studies.show.report import Report, chapter, drawing
 from studies.show.words import control_text, motion_text
 from studies.study.margin import margin_text
 from studies.study.spec import Study
@@ -207,14 +206,7 @@ def say(result: TwinResult) -> Report:
         chapters=[
             chapter(
                 "Side by side",
-                Drawing(
-                    FIGURE,
-                    """Both models around the end of the reference trajectory (dotted): mid-span
-                    deflection of the links from the chord between their ends, distance of the
-                    platform from the reference trajectory, difference of the deflections, and the
-                    actuator with the largest voltages""",
-                    partial(side_by_side, result.plan, result.runs),
-                ),
+                drawing(side_by_side, result.plan, result.runs, name=FIGURE),
                 Rows(list(GAP_HEAD), gap_rows(result)),
                 f"""One step of the ADC is {rounding:.3g} V of a sensor. Where signals come near it,
                 the rounding of the two loops differs, and percentages mean little.""",
