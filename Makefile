@@ -10,7 +10,7 @@ BIN := .venv/bin
 PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 .DEFAULT_GOAL := help
-.PHONY: help install study explore docs docs-tests notebooks test campaigns budget gpu smoke lint check clean venv
+.PHONY: help install study explore docs docs-tests notebooks reference test campaigns budget gpu smoke lint check clean venv
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /make \1\t/p' Makefile | expand -t 16
@@ -36,6 +36,9 @@ notebooks: .venv/with-notebook  ## open the notebooks in JupyterLab
 
 docs: .venv/with-docs docs-tests  ## test what documents say, and build the site, notebooks run, into docs/_build/html
 	$(BIN)/python -m sphinx -W --keep-going -n -q -j 2 -c docs . docs/_build/html
+
+reference: .venv/installed  ## write the reference of commands, fields, metrics and results into docs/reference
+	$(BIN)/python docs/_ext/reference.py
 
 docs-tests: .venv/installed  ## run the examples of documents, ready files and notebooks
 	$(PYTEST) docs/tests

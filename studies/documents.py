@@ -24,7 +24,7 @@ DOCUMENTS = {
     "simulate": "single.documents.RunDocument",
     "spillover": "spillover.certificate.Certificate",
     "sweep": "sweeps.dry_run.PlanDocument",
-    "twin": "twin.report.TwinDocument",
+    "twin": "twin.say.TwinDocument",
     "verify": "verify.run.ModelVerification",
 }
 

@@ -1,9 +1,13 @@
-"""Text of the reference pages, from the command line's own help and the schema of the files."""
+"""Text of the reference pages, from the command line's own help and the schema of the files.
+
+`python docs/_ext/reference.py` writes it into the pages, below the marks that name it.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, get_args, get_origin
 
 import typer
@@ -14,6 +18,7 @@ from pydantic_core import PydanticUndefined
 from jaxmodel.metrics import METRICS
 from studies.cli import app
 from studies.commission.spec import Commission
+from studies.documents import DOCUMENTS, schema
 from studies.fitting.spec import ENTRIES, Fit, Next
 from studies.space.spec import Block, Screen, Sweep
 from studies.study.explain import allowed_values, unit_of
@@ -181,12 +186,65 @@ def metrics_text() -> str:
     return table(("metric", "meaning", "unit", "axes"), rows)
 
 
+# results
+
+
+def results_text() -> str:
+    """Every document, with the fields and axes of its numbers."""
+    return "\n\n".join(_result_text(command) for command in DOCUMENTS)
+
+
+def _result_text(command: str) -> str:
+    document = schema(command)
+    rows = list(_rows_of(document, ""))
+    head = f"## {command}\n\n{document['description']}"
+    return f"{head}\n\n{table(('field', 'meaning', 'unit', 'kind'), rows)}"
+
+
+def _rows_of(rule: dict[str, Any], place: str) -> Iterator[tuple[str, str, str, str]]:
+    """A row of each field, and of each of what it holds."""
+    for name, one in rule["properties"].items():
+        if name in ("format", "format_version"):
+            continue
+        kind, inner = _kind(one)
+        field = f"{place}{name}"
+        yield f"`{field}`", one.get("description", ""), one.get("unit", ""), kind
+        if inner is not None:
+            yield from _rows_of(inner, f"{field}[]." if kind.startswith("list") else f"{field}.")
+
+
+def _kind(rule: dict[str, Any]) -> tuple[str, dict[str, Any] | None]:
+    """Kind of a value in words, and the rule of the fields it has."""
+    if "anyOf" in rule:
+        kinds = [_kind(one) for one in rule["anyOf"]]
+        inner = next((x for _, x in kinds if x is not None), None)
+        return " or ".join(dict.fromkeys(kind for kind, _ in kinds)), inner
+    if "enum" in rule:
+        return ", ".join(map(str, rule["enum"])), None
+    if rule.get("type") == "array":
+        kind, inner = _kind(rule["items"])
+        return f"list of {kind}", inner
+    if "properties" in rule:
+        return "object", rule
+    kinds = rule.get("type", "any")  # ["number", "null"] of numbers that may not be finite
+    return kinds if isinstance(kinds, str) else kinds[0], None
+
+
 #: What pages name in `<!-- generated: NAME -->`.
 TEXTS: dict[str, Callable[[], str]] = {
     "commands": commands_text,
     "fields": fields_text,
     "metrics": metrics_text,
+    "results": results_text,
 }
+MARK = re.compile(r"<!-- generated: (\w+) -->\n.*?<!-- end -->", re.DOTALL)
+
+
+def filled(page: str) -> str:
+    """A page with its marks followed by what they name."""
+    return MARK.sub(
+        lambda x: f"<!-- generated: {x[1]} -->\n\n{TEXTS[x[1]]()}\n\n<!-- end -->", page
+    )
 
 
 # members of tuples
@@ -200,3 +258,8 @@ def members_text(source: str) -> dict[str, str]:
     """
     member = r"^    (\w+): [^#\n]+(?:  # (.+))?$"
     return {name: text for name, text in re.findall(member, source, re.MULTILINE) if text}
+
+
+if __name__ == "__main__":
+    for path in sorted((Path(__file__).parents[1] / "reference").glob("*.md")):
+        path.write_text(filled(path.read_text(encoding="utf-8")), encoding="utf-8")

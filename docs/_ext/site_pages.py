@@ -1,4 +1,4 @@
-"""Parts of the site that follow from the program: reference pages, `llms.txt`, the root."""
+"""Parts of the site that follow from the program: members of tuples, `llms.txt`, the root."""
 
 from __future__ import annotations
 
@@ -9,18 +9,12 @@ from typing import Any
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
-from reference import TEXTS, members_text
+from reference import members_text
 from sphinx.application import Sphinx
 
-MARK = r"<!-- generated: (\w+) -->"
 #: Inline formulas with more characters than this get a box of their own.
 LONG = 40
 REDIRECT = '<!DOCTYPE html><meta http-equiv="refresh" content="0; url={}"><title>{}</title>\n'
-
-
-def fill_in(app: Sphinx, name: str, source: list[str]) -> None:
-    """Replace the marks of a page by what they name."""
-    source[0] = re.sub(MARK, lambda found: TEXTS[found[1]](), source[0])
 
 
 def spread_notebooks(app: Sphinx, env: Any, names: list[str]) -> None:
@@ -93,7 +87,6 @@ def _line(app: Sphinx, name: str) -> str:
 def setup(app: Sphinx) -> dict[str, Any]:
     app.add_html_math_renderer("mathml", (show_math, None), (show_math, None))
     app.connect("env-before-read-docs", spread_notebooks)
-    app.connect("source-read", fill_in)
     app.connect("autodoc-process-docstring", add_members)
     app.connect("autodoc-process-signature", shorten)
     app.connect("autodoc-skip-member", leave_out)

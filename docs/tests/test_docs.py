@@ -90,6 +90,12 @@ def test_every_reference_has_its_place():
     assert sorted(marks) == sorted(reference.TEXTS)
 
 
+@pytest.mark.parametrize("name", ["commands", "fields", "results"])
+def test_the_reference_is_current(name):
+    text = page(f"docs/reference/{name}.md")
+    assert text == reference.filled(text), "run: make reference"
+
+
 def test_members_are_read_from_the_comments_beside_them():
     source = (
         "class A(NamedTuple):\n    mass: Array  # [kg], (3,)\n    other: int\n    k: int = 1  # x\n"
