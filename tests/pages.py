@@ -4,15 +4,18 @@ import gzip
 import json
 import re
 import subprocess
-from base64 import b64decode
+from base64 import b64decode, b64encode
+from hashlib import sha256
 from html import unescape
 from html.parser import HTMLParser
 from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 from matplotlib.text import Text
 from PIL import Image
 
+from studies.show import pages
 from studies.show.figures import STYLE
 from studies.show.pages import WIDE, render
 from tests.browser import browser_command
@@ -26,8 +29,11 @@ FIRST_BYTES = {
     "data:image/gif;base64": b"GIF89a",
 }
 VOID = ("img", "meta", "br", "hr", "wbr")
+#: The only script of a page sorts its tables.
+SCRIPT = Path(pages.__file__).with_name("page.js").read_text(encoding="utf-8")
+DIGEST = b64encode(sha256(SCRIPT.encode()).digest()).decode()
 #: Nothing of a report needs one of these.
-FORBIDDEN = ("script", "link", "iframe", "object", "embed", "base", "form", "svg", "video")
+FORBIDDEN = ("link", "iframe", "object", "embed", "base", "form", "svg", "video")
 
 
 class Page(HTMLParser):
@@ -36,7 +42,10 @@ class Page(HTMLParser):
     def __init__(self, text):
         super().__init__()
         self.open, self.tags, self.text, self.title, self.rows = [], [], "", "", []
+        self.scripts = []
         self.images = []  # size in pixels and description of each
+        self.policy = re.search('<meta http-equiv="Content-Security-Policy" content="(.*?)">', text)
+        self.policy = self.policy[1] if self.policy else ""
         assert text.startswith('<!DOCTYPE html>\n<html lang="en">')
         self.feed(text)
         self.close()
@@ -66,6 +75,8 @@ class Page(HTMLParser):
             self.open.append(tag)
 
     def handle_endtag(self, tag):
+        if tag == "script":
+            assert self.scripts == [SCRIPT] and f"sha256-{DIGEST}'" in self.policy
         assert self.open and self.open.pop() == tag, f"</{tag}> closes something else"
         if tag == "table":
             assert len(set(self.rows[-1])) == 1, f"cells of a table's rows: {self.rows[-1]}"
@@ -73,6 +84,8 @@ class Page(HTMLParser):
     def handle_data(self, data):
         if self.open[-1:] == ["style"]:
             assert "url(" not in data and "@import" not in data
+        elif self.open[-1:] == ["script"]:
+            self.scripts.append(data)
         elif self.open[-1:] == ["title"]:
             self.title += data
         else:
@@ -253,10 +266,10 @@ def smallest_text(figure):
     """The smallest text of a figure on its page, on a wide screen or on a phone: pixels, text."""
     inches, dpi = figure.get_figwidth(), STYLE["savefig.dpi"]
     natural = inches * dpi
-    desk = min(natural, _css(r"figure \{[^}]*max-width: ([\d.]+)rem"))
+    desk = min(natural, _css(r"--column: ([\d.]+)rem"))
     phone = _PHONE - 2 * _css(r"body \{[^}]*padding: 0 ([\d.]+)rem")
     if natural > WIDE:
-        phone = _css(r"img\.wide \{[^}]*width: ([\d.]+)rem")
+        phone = _css(r"img\.wide \{[^}]* width: ([\d.]+)rem")
     scale = min(desk, phone, natural) / inches / 72
     texts = [x for x in figure.findobj(Text) if x.get_visible() and x.get_text().strip()]
     sizes = [(scale * x.get_fontsize(), x.get_text()) for x in texts]

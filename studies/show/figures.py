@@ -3,7 +3,7 @@
 They only convert units. The colours of Okabe and Ito are distinguishable for colour-blind readers;
 in greyscale, the two curves of a comparison differ in lightness and width.
 
-A page shows a figure of `WIDTH` at most 60 rem wide, and on a phone 40 rem wide in a box that
+A page shows a figure of `WIDTH` 54 rem wide, and on a phone 40 rem wide in a box that
 scrolls, where text of `SMALL` has 9.6 pixels: no figure has smaller text or is wider.
 """
 

@@ -1,8 +1,9 @@
 """Reports as web pages, and all other templates (Jinja2).
 
 A page is one HTML file that contains its figures, the files it refers to and the versions that made
-it. It runs no scripts and loads nothing, so it opens offline, in an email, and in many years. One
-template, `show/page.html`, prints every `Report`; `show/card.html` prints the same for a notebook.
+it. It loads nothing, and its only script sorts tables, so it opens offline, in an email, and in
+many years. One template, `show/page.html`, prints every `Report`; `show/card.html` prints the same
+for a notebook.
 
 Other templates are in the folder of the module that fills them. Whatever a value contains is shown
 as text. A name without a value is an error.
@@ -15,6 +16,7 @@ from base64 import b64encode
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
+from hashlib import sha256
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -147,10 +149,13 @@ def page(report: Report, folder: Path | None = None) -> str:
         ValueError: a figure that is not in the folder.
     """
     chapters = [x for x in report.chapters if x]
+    script = (_ROOT / "show" / "page.js").read_text(encoding="utf-8")
     about = next((x for x in report.files.values() if isinstance(x, Study)), None)
     return render(
         "show/page.html",
         report=replace(report, chapters=chapters),
+        script=Markup(script),
+        digest=b64encode(sha256(script.encode()).digest()).decode(),
         image=lambda name, caption: _image(folder, name, caption),
         facts=config.origin() | _verified(about),
         files={title: _file(content) for title, content in report.files.items()},
