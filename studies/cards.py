@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 
 from studies.show import figures, pages
 from studies.show.pages import inline_image, render
-from studies.show.units import count_text
 from studies.study.labels import describe
 from studies.study.margin import margin_in_db, stretch_text
 
@@ -76,30 +75,6 @@ def _run(run: Any) -> Card:
         figures.legend_above(figure, ax)
     table = link_rows(run)
     return Card(run.study.title, [x for x in lines if x], table.heads, table.rows, figure=figure)
-
-
-def _sweep(outcome: Any) -> Card:
-    """Of `run_sweep`."""
-    from studies.engine.results import read_sweep
-    from studies.errors import StudyError
-    from studies.sweeps.plots import plot
-    from studies.sweeps.show import case_rows, ranked_cases, ranking, status_rows
-
-    data, figure = read_sweep(outcome.out), None
-    listing, metric = status_rows(data), ranking(data)
-    lines = [
-        f"{outcome.n_done} of {count_text(len(outcome.table), 'case')} done, "
-        f"{outcome.n_run} of them now, in {outcome.run_time:.3g} s."
-    ]
-    try:
-        best = ranked_cases(data, metric, count=MOST)
-        figure = plot(data, None, metric)
-    except StudyError:  # no case is ok, or there is nothing to draw over
-        best = np.array([], int)
-    if len(best):
-        lines.append(f"Best by {metric}:")
-        listing = case_rows(data, best, [metric])
-    return Card(data.spec.study.title, lines, listing.heads, listing.rows, figure=figure)
 
 
 def _tuning(found: Any) -> Card:
@@ -183,11 +158,10 @@ def _modes(modes: Any) -> Card:
 
 
 #: Module with the function `say`, by the name of the type.
-SAY = {"Certificate": "studies.spillover.say"}
+SAY = {"Certificate": "studies.spillover.say", "Outcome": "studies.sweeps.say"}
 #: By the name of the type.
 CARDS: dict[str, Callable[[Any], Card]] = {
     "Run": _run,
-    "Outcome": _sweep,
     "TuneFindings": _tuning,
     "Fitted": _fit,
     "LawFindings": _laws,

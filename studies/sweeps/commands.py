@@ -112,7 +112,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         with Phases(console, names, quiet) as phases:
             done = run_sweep(sweep_spec, out, resume, workers=workers, phases=phases)
             if report and not done.is_interrupted:
-                from studies.sweeps.report import write_sweep_report
+                from studies.sweeps.say import write_sweep_report
 
                 phases.begin("report")
                 write_sweep_report(out)
@@ -194,13 +194,12 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             raise StudyError("--tolerance: for --breaks only; give both")
         if breaks:
             start()
-        from studies.engine.results import direction
         from studies.sweeps.show import (
-            counted_text,
             print_cases,
             print_left_out,
             print_uncontrolled,
             ranked_cases,
+            ranking_text,
         )
 
         data, name, agreed = _read(folder), by.removeprefix("-"), ""
@@ -225,10 +224,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         print_uncontrolled(data, name, console)
         if agreed:
             console.print(agreed, soft_wrap=True)
-        counted = counted_text(data, name)
-        console.print(
-            ", ".join(filter(None, (f"by {name}", f"{direction(by)} first", counted))) + ":"
-        )
+        console.print(f"{ranking_text(data, by, subject_to)}:", soft_wrap=True)
         print_cases(data, cases, [name], console)
         print_left_out(data, console)
         for entry in changes or ():

@@ -28,10 +28,14 @@ from studies.engine.results import (
 )
 from studies.errors import ResolutionWarning, StudyError, field_error
 from studies.show.listing import Rows, print_rows
-from studies.show.units import count_text, headed, readable, settling_text
+from studies.show.report import sentence
+from studies.show.units import count_text, headed, number, readable, settling_text
+from studies.show.words import motion_text
 from studies.study.entries import links_text
 from studies.study.margin import ENOUGH, GUESSED, margin_text
 from studies.study.resolution import is_deflection, least_step, resolution_text
+from studies.study.spec import Study
+from studies.study.window import residual_delay
 from studies.sweeps.environments import (
     design_values,
     environments_text,
@@ -47,6 +51,7 @@ from studies.sweeps.records import (
     case_records,
     failed_cases,
     failed_records,
+    is_there,
     reason,
     status_records,
     watched,
@@ -186,18 +191,34 @@ def show(data: SweepData, console: Console, is_failed: bool) -> None:
     by = ranking(data)
     if is_ranked(data, by):
         condition = requirement(data, by)
-        best = ranked_cases(data, by, condition)
         print_uncontrolled(data, by, console)
-        met = f", of those with {condition}" if condition else ""
-        console.print(f"best cases by {by}, {direction(by)} first, {counted_text(data, by)}{met}:")
-        print_cases(data, best, [by], console)
+        console.print(f"{ranking_text(data, by, condition)}:", soft_wrap=True)
+        print_cases(data, ranked_cases(data, by, condition), [by], console)
+
+
+def ranking_text(data: SweepData, by: str, condition: str = "") -> str:
+    """Which cases are the best, in words."""
+    name = by.removeprefix("-")
+    met = f"of those with {condition}" if condition else ""
+    parts = f"best cases by {name}", f"{direction(by)} first", counted_text(data, name), met
+    return ", ".join(filter(None, parts))
+
+
+def runs_text(study: Study) -> str:
+    """What moves the machine and when vibration is residual, in sentences."""
+    window, delay = study.metrics.residual_length, residual_delay(study)
+    return (
+        f"{sentence(motion_text(study))} Residual window: {number(window, 's')} ms, from "
+        f"{number(delay, 's')} ms after the reference trajectory."
+    )
 
 
 def is_ranked(data: SweepData, metric: str) -> bool:
-    """Whether some case that is ok has a metric."""
-    if metric.partition("[")[0] not in data.variables:  # no run has finished
+    """Whether some case that is ok, or design whose cases are, has a metric."""
+    try:
+        return bool(len(ranked_cases(data, metric, count=1)))
+    except StudyError:
         return False
-    return bool(np.isfinite(metric_values(data, metric)[data["status"] == status.OK]).any())
 
 
 def status_rows(data: SweepData) -> Rows:
@@ -237,14 +258,10 @@ def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console:
     note = mark_note(data, cases, metrics[0])
     if note:
         console.print(note, soft_wrap=True)
-    if _has_margins(data):
+    if is_there(data, MARGIN):
         console.print(GUESSED, soft_wrap=True)
     for warning in ranking_warnings(data, cases, metrics[0]):
         console.print(f"[bold red]{escape(warning)}[/]", soft_wrap=True, markup=True)
-
-
-def _has_margins(data: SweepData) -> bool:
-    return MARGIN in data.variables and bool(np.isfinite(data[MARGIN]).any())
 
 
 def ranking_warnings(data: SweepData, cases: np.ndarray, by: str) -> list[str]:
@@ -271,7 +288,7 @@ def uncontrolled_text(data: SweepData, by: str) -> str:
         return ""
     cases = metric_values(data, by)[data["status"] == status.OK]
     is_beaten = (cases < value * (1 - ROUNDING)).any()
-    text = f"{by} of the baseline without control: {_shown(data, by, value)}"
+    text = f"{by} of the baseline without control: {quantity(data, by, value)}"
     return text if is_beaten else f"{text}; no case is below it"
 
 
@@ -280,10 +297,10 @@ def mark_note(data: SweepData, cases: np.ndarray, metric: str) -> str:
     value = uncontrolled_value(data, metric)
     if value is None or not is_worse(metric_values(data, metric)[cases], value).any():
         return ""
-    return f"{MARK}: worse than the baseline without control, {_shown(data, metric, value)}"
+    return f"{MARK}: worse than the baseline without control, {quantity(data, metric, value)}"
 
 
-def _shown(data: SweepData, metric: str, value: float) -> str:
+def quantity(data: SweepData, metric: str, value: float) -> str:
     """A value of a metric in the unit that reports show."""
     factor, unit = readable(unit_of_metric(data, metric))
     return f"{factor * value:.4g} {unit}".rstrip()
@@ -322,9 +339,7 @@ def unranked_text(data: SweepData, by: str) -> str:
 
 def margin_warning(data: SweepData, cases: np.ndarray) -> str:
     """Warning if cases have a gain margin below `ENOUGH`, "" if none has."""
-    margin = np.full(len(cases), np.nan)
-    if MARGIN in data.variables:
-        margin = design_values(data, MARGIN)[cases]
+    margin = design_values(data, MARGIN)[cases] if MARGIN in data.variables else np.array([])
     low = int(np.sum(margin < ENOUGH))
     if not low:
         return ""
@@ -444,7 +459,7 @@ def requirement(data: SweepData, by: str, is_safe: bool = True) -> str:
         As much of that, as a condition, as any case with this metric meets; "" for nothing.
     """
     own = data.spec.screen.subject_to if data.spec.screen is not None else ""
-    is_safe = is_safe and _has_margins(data)
+    is_safe = is_safe and is_there(data, MARGIN)
     conditions = [x for x in (own, f"{MARGIN} >= {ENOUGH:g}" if is_safe else "") if x]
     for condition in dict.fromkeys((" and ".join(map(_bracket, conditions)), *conditions)):
         try:
