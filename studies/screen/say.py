@@ -20,7 +20,7 @@ from studies.screen.stored import BEST
 from studies.screen.tally import LEFT_OUT, quantile
 from studies.show.listing import Rows
 from studies.show.pages import write_report
-from studies.show.report import Chapter, Drawing, Part, Report, chapter
+from studies.show.report import Chapter, Drawing, Report, chapter
 from studies.show.units import count_text, headed, readable
 from studies.study.margin import margin_text
 from studies.study.template import toml_text
@@ -31,6 +31,8 @@ LATER = (
     " (what saturated or clipped may have an unstable loop: stability is judged later, of the best "
     "that are ok)"
 )
+#: Why designs did not run.
+DROPPED = "left out by sweep.where, or the same as another"
 #: Shares of the designs whose quantiles are shown.
 SHARES = (0.0001, 0.01, 0.1, 0.5, 0.9)
 #: Designs in the table.
@@ -55,22 +57,21 @@ def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
 
 def say(done: ScreenOutcome, folder: Path = Path()) -> Report:
     """What a screen tells; folder: its own, in commands."""
-    study = done.screen.spec.study
+    spec, shards = done.screen.spec, count_text(done.screen.n_shards, "shard")
+    lost = f"**Of {shards}, {len(done.lost)} left out; retry with `--resume`.**"
     return Report(
-        title=f"{study.title or 'untitled study'}: screen",
+        title=f"{spec.study.title or 'untitled study'}: screen",
         result=summary_lines(done),
         question=_question(done.screen),
         next_steps=_next_steps(done, folder),
-        top=_top(done),
+        top=[lost if done.lost else "", *_drawings(done)],
         chapters=[
-            *_best(done),
+            _best(done),
+            chapter("What margin costs", margin_rows(done)),
             chapter("How the designs ended", ending_rows(done)),
-            _quantiles(done),
+            chapter("Quantiles", quantile_rows(done)),
         ],
-        files={
-            "Sweep file": toml_text(done.screen.spec.data),
-            "Study of all designs": study,
-        },
+        files={"Sweep file": toml_text(spec.data), "Study of all designs": spec.study},
     )
 
 
@@ -81,16 +82,12 @@ def _value(done: ScreenOutcome, value: float) -> str:
 
 def ending_rows(done: ScreenOutcome) -> Rows:
     """How the designs ended: number, share and reason, most frequent first."""
-    endings, rows = done.tally.endings, []
-    for code in np.argsort(-endings, kind="stable"):
-        if endings[code]:
-            reason = (
-                "left out by sweep.where, or the same as another"
-                if code == LEFT_OUT
-                else status.REASONS[code]
-            )
-            share = f"{100 * endings[code] / done.tally.n_designs:.3g} %"
-            rows.append([f"{endings[code]:,}", share, reason])
+    endings, reasons = done.tally.endings, {**status.REASONS, LEFT_OUT: DROPPED}
+    rows = [
+        [f"{endings[k]:,}", f"{100 * endings[k] / done.tally.n_designs:.3g} %", reasons[int(k)]]
+        for k in np.argsort(-endings, kind="stable")
+        if endings[k]
+    ]
     return Rows(["designs", "share", "ending"], rows)
 
 
@@ -103,7 +100,8 @@ def quantile_rows(done: ScreenOutcome) -> Rows:
         if share * sketch.sum() >= 1:
             value = _value(done, clipped_quantile(done, share))
             rows.append([f"{100 * share:g} %", f"{value} or {bound}"])
-    return Rows(["share of the designs", done.screen.entry], rows)
+    which = "share of the designs that ended well, unstable ones included"
+    return Rows([which, f"{done.screen.entry}, exact within 1 %"], rows)
 
 
 def clipped_quantile(done: ScreenOutcome, share: float) -> float:
@@ -194,15 +192,18 @@ def _edge_lines(done: ScreenOutcome, selection: Selection) -> list[str]:
     return [f"most of these are at {' and '.join(ends)}: widen it if you can"] if ends else []
 
 
-def margin_rows(done: ScreenOutcome, selection: Selection) -> Rows:
+def margin_rows(done: ScreenOutcome) -> Rows:
     """What more margin costs: margins, how many judged candidates have them, and the best one."""
-    rows = []
+    rows: list[list[str]] = []
+    if done.selection is None:
+        return Rows([], rows)
     for least in LEAST_MARGINS:
-        enough = np.flatnonzero(selection.margin >= least)
+        enough = np.flatnonzero(done.selection.margin >= least)
         if len(enough):
-            best = _value(done, selection.value[enough[0]])
+            best = _value(done, done.selection.value[enough[0]])
             rows.append([f"{least:g}", f"{len(enough):,}", best])
-    return Rows(["gain margin", "candidates", f"best {done.screen.entry}"], rows)
+    heads = ["gain margin of at least", "candidates judged", f"best {done.screen.entry}"]
+    return Rows(heads, rows)
 
 
 def _uncontrolled_line(done: ScreenOutcome) -> list[str]:
@@ -246,57 +247,31 @@ def _next_steps(done: ScreenOutcome, folder: Path) -> str:
     runs again."""
 
 
-def _top(done: ScreenOutcome) -> list[Part]:
-    """What is left out, and the figures, if there are values that a log scale has."""
-    parts: list[Part] = []
-    if done.lost:
-        shards = count_text(done.screen.n_shards, "shard")
-        parts.append(f"**Of {shards}, {len(done.lost)} left out; retry with `--resume`.**")
+def _drawings(done: ScreenOutcome) -> list[Drawing]:
+    """The figures, if there are values that a log scale has."""
     if not done.tally.sketch[0, 1:].any():
-        return parts
-    baseline = "" if done.uncontrolled is None else "; dashed: the baseline without control"
-    parts.append(
-        Drawing(
-            "values",
-            f"""Designs that ended well by value, unstable ones included; line: the last one that
-            was kept{baseline}""",
-            partial(values, done),
-        )
-    )
-    if done.screen.axes.names:
-        parts.append(
-            Drawing(
-                "influence",
-                """Values of the designs that ended well by interval of every axis, unstable ones
-                included: the median and, of enough designs, the best 10 % and the best 0.1 %.
-                Where few end well, they differ in more than this axis""",
-                partial(influence, done),
-            )
-        )
-    return parts
-
-
-def _best(done: ScreenOutcome) -> list[Chapter | None]:
-    """The designs that are kept, and what margin costs."""
-    if done.selection is None:
         return []
+    baseline = "" if done.uncontrolled is None else "; dashed: the baseline without control"
+    by_value = f"""Designs that ended well by value, unstable ones included; line: the last one that
+    was kept{baseline}"""
+    by_axis = """Values of the designs that ended well by interval of every axis, unstable ones
+    included: the median and, of enough designs, the best 10 % and the best 0.1 %. Where few end
+    well, they differ in more than this axis"""
+    drawn = [Drawing("values", by_value, partial(values, done))]
+    if done.screen.axes.names:
+        drawn.append(Drawing("influence", by_axis, partial(influence, done)))
+    return drawn
+
+
+def _best(done: ScreenOutcome) -> Chapter | None:
+    if done.selection is None:
+        return None
     cases = "None of these is kept: they lack the margin."
     if done.n_kept:
         cases = f"""Cases are those of `{BEST}`, a sweep of all {done.n_kept:,} designs that were
         kept, with the same ids."""
-    return [
-        chapter(
-            "The best designs",
-            f"{cases} Designs are rows of the sweep that was screened. Both count from 0.",
-            _best_rows(done, done.selection),
-        ),
-        chapter(
-            "What margin costs",
-            """Of the candidates that were judged, best first until enough were found: how many
-            have at least this gain margin, and the best one of them.""",
-            margin_rows(done, done.selection),
-        ),
-    ]
+    text = f"{cases} Designs are rows of the sweep that was screened. Both count from 0."
+    return chapter("The best designs", text, _best_rows(done, done.selection))
 
 
 def _best_rows(done: ScreenOutcome, selection: Selection) -> Rows:
@@ -318,10 +293,3 @@ def _best_rows(done: ScreenOutcome, selection: Selection) -> Rows:
     ]
     heads = ["case", "design", headed(screen.entry, unit), "gain margin"]
     return Rows([*heads, *map(axis_head, screen.axes.names)], rows)
-
-
-def _quantiles(done: ScreenOutcome) -> Chapter | None:
-    if done.selection is None:
-        return None
-    text = "Of all designs that ended well, unstable ones included, exact within 1 %."
-    return chapter("Quantiles", text, quantile_rows(done))

@@ -11,16 +11,9 @@ import numpy as np
 
 from jaxmodel import status
 from studies.engine.fidelity import Agreement, agreement
-from studies.engine.results import (
-    SweepData,
-    as_sweep,
-    counted_links,
-    metric_values,
-    swept_names,
-)
+from studies.engine.results import SweepData, as_sweep, counted_links, metric_values, swept_names
 from studies.errors import shown
 from studies.publish import publish
-from studies.show.listing import Rows
 from studies.show.pages import write_report
 from studies.show.report import Chapter, Drawing, Items, Report, chapter, machine, sentence
 from studies.show.units import count_text
@@ -32,7 +25,7 @@ from studies.study.margin import margin_in_db
 from studies.study.template import toml_text, toml_value
 from studies.sweeps import show
 from studies.sweeps.dry_run import axis_rows
-from studies.sweeps.environments import environments_text
+from studies.sweeps.environments import environments_text, has_environments
 from studies.sweeps.plots import front, has_axes, plot
 from studies.sweeps.records import MARGIN, is_there
 from studies.sweeps.run import Outcome
@@ -76,23 +69,19 @@ def say(
     metric, spec = show.ranking(data), data.spec
     best = show.recommended(data, metric) if show.is_ranked(data, metric) else np.array([], int)
     shown_study = case_study(data.table, int(best[0])) if len(best) else spec.study
-    sketch, endings = machine(shown_study), show.status_rows(data)
+    sketch = machine(shown_study)
     return Report(
         title=f"{spec.study.title or 'untitled study'}: sweep",
-        result=[
-            *_best_texts(data, metric, best),
-            _ended_text(endings),
-            *_model_texts(data, agreed),
-        ],
+        result=[*_best_texts(data, metric, best), *_run_texts(data, agreed)],
         question=f"""which of {count_text(data.n_cases, "case")} of
         {", ".join(swept_names(data)) or "a list"} are the
         {show.ranking_text(data, metric, show.requirement(data, metric))}?
         {show.runs_text(spec.study)}""",
         next_steps=_next_steps(data, metric, best, folder),
-        top=[replace(sketch, caption=f"{sketch.caption}. Where cases differ: of the best one")],
+        top=[replace(sketch, caption=f"{sketch.caption}. Where cases differ, it is the best")],
         chapters=[
             _best_cases(data, metric, best),
-            chapter("How the cases ended", endings),
+            chapter("How the cases ended", show.status_rows(data)),
             _varied(data),
             _causes(data),
         ],
@@ -103,20 +92,19 @@ def say(
 def _best_texts(data: SweepData, metric: str, best: np.ndarray) -> list[str]:
     """The best case, and what to know before acting on it, in sentences."""
     if not len(best):
-        return [f"no case has {metric}"]
+        what = "design has, in each of its environments," if has_environments(data) else "case has"
+        return [f"no {what} {metric}"]
     first, value = int(best[0]), metric_values(data, metric)
     is_known = (data["status"] == status.OK) & np.isfinite(value)
     setting = ", ".join(
         f"{x} = {show.shown_value(data, x, first)} {show.unit_of_metric(data, x)}".rstrip()
         for x in swept_names(data)
     )
-    reached = show.quantity(data, metric, value[first])
-    text = f"best by {metric}: case {first} with {reached} ({setting})"
+    quantity = partial(show.quantity, data, metric)
+    text = f"best by {metric}: case {first} with {quantity(value[first])} ({setting})"
     if is_there(data, MARGIN) and np.isfinite(data[MARGIN][first]):
         text += f", gain margin {margin_in_db(float(data[MARGIN][first]))}"
-    median = (
-        f"the median of the ok cases is {show.quantity(data, metric, np.median(value[is_known]))}"
-    )
+    median = f"the median of the ok cases is {quantity(np.median(value[is_known]))}"
     idle, free = _idle_texts(data, metric, first), show.uncontrolled_text(data, metric)
     texts = ["; ".join(filter(None, (text, *idle, median, free)))]
     spread = np.ptp(value[best]) / max(abs(value[first]), 1e-300)
@@ -140,17 +128,12 @@ def _idle_texts(data: SweepData, metric: str, case: int) -> list[str]:
     ]
 
 
-def _ended_text(endings: Rows) -> str:
-    counts = {name: int(count) for name, count, _ in endings.rows}
-    n_ok, total = counts.pop("ok", 0), sum(counts.values())
+def _run_texts(data: SweepData, agreed: Agreement | None) -> list[str]:
+    """How cases ended, what the linear model did, and how well it agrees with the full one."""
+    counts = {name: count for name, count, _ in show.status_rows(data).rows}
+    ended = f"{counts.pop('ok', 0)} of {count_text(data.n_cases, 'case')} ended ok"
     failures = "; ".join(f"{count}: {name}" for name, count in [*counts.items()][:3])
-    ended = f"{n_ok} of {count_text(n_ok + total, 'case')} ended ok"
-    return f"{ended} ({failures})" if failures else ended
-
-
-def _model_texts(data: SweepData, agreed: Agreement | None) -> list[str]:
-    """What the linear model did, and how well it agrees with the full one."""
-    texts, checked = [], check_screen(data)
+    texts, checked = [f"{ended} ({failures})" if failures else ended], check_screen(data)
     if data.spec.sweep.fidelity == "linear":
         texts.append(
             "**all runs are of the linear model** (`sweep.fidelity`); check the best cases with "
@@ -168,22 +151,18 @@ def _next_steps(data: SweepData, metric: str, best: np.ndarray, folder: str) -> 
     subject = f' --subject-to "{condition}"' if condition else ""
     others = [x for x in OTHERS if x in data.variables and x != metric.partition("[")[0]]
     names = " or ".join(f"`--by {x}`" for x in others)
+    alike = f"; check whether another metric ranks them alike ({names})" if others else ""
     case = f"{folder} --case {best[0]}"
-    return (
-        f"""`studies best {folder} --by "{metric}"{subject}` for more of them, `studies replay
-        {case} --out run.h5 --report` for the trajectories of the best, `studies spillover {case}
-        --out certificate` for its safety on plants that differ from the model"""
-        + (f"; check whether another metric ranks them alike ({names})" if others else "")
-        + "."
-    )
+    return f"""`studies best {folder} --by "{metric}"{subject}` for more of them, `studies replay
+    {case} --out run.h5 --report` for the trajectories of the best, `studies spillover {case} --out
+    certificate` for its safety on plants that differ from the model{alike}."""
 
 
 def _best_cases(data: SweepData, metric: str, best: np.ndarray) -> Chapter | None:
-    title = f"Best cases by {metric}"
     if not len(best):
-        return chapter(title, "No case of status ok has it.")
+        return None
     return chapter(
-        title,
+        f"Best cases by {metric}",
         _rival_text(data, metric, int(best[0])),
         environments_text(data),
         show.case_rows(data, best, [metric]),

@@ -81,15 +81,6 @@ SHARES = (
 )
 
 
-def select(data: SweepData, subject_to: str) -> np.ndarray:
-    """Cases of status ok for which a condition holds, (n,).
-
-    Raises:
-        StudyError: not a condition, or unknown names in it.
-    """
-    return (data["status"] == status.OK) & meets(data, subject_to, "--subject-to")
-
-
 def best_cases(
     sweep: SweepData | str | Path, by: str, subject_to: str = "", count: int = 10
 ) -> pandas.DataFrame:
@@ -167,7 +158,8 @@ def ranked_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10
     value = metric_values(data, name)
     if value.dtype.kind not in "fiub":
         raise StudyError(f"--by {by}: a text, not a number")
-    chosen = np.flatnonzero(whole_designs(data, select(data, subject_to) & np.isfinite(value)))
+    is_fine = (data["status"] == status.OK) & meets(data, subject_to, "--subject-to")
+    chosen = np.flatnonzero(whole_designs(data, is_fine & np.isfinite(value)))
     of_all = "in each of its environments" if has_environments(data) else ""
     what = "design" if of_all else "case"
     if len(chosen) == 0 and subject_to:
@@ -182,18 +174,23 @@ def ranked_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10
 
 
 def show(data: SweepData, console: Console, is_failed: bool) -> None:
-    """Print an overview, or the failed cases one by one."""
+    """Print an overview, or the failed cases one by one, and what the failures depend on."""
     if is_failed:
         _print_failed(data, console)
-        return
+    else:
+        _print_overview(data, console)
+    if (causes := cause_rows(data)).rows:
+        console.print(f"what the failures depend on ({SHARES}):", soft_wrap=True)
+        print_rows(causes, console)
+
+
+def _print_overview(data: SweepData, console: Console) -> None:
     console.print(f"{data.spec.study.title}: {data.n_cases} cases, {', '.join(swept_names(data))}")
     print_rows(status_rows(data), console)
     by = ranking(data)
     if is_ranked(data, by):
         condition = requirement(data, by)
-        print_uncontrolled(data, by, console)
-        console.print(f"{ranking_text(data, by, condition)}:", soft_wrap=True)
-        print_cases(data, ranked_cases(data, by, condition), [by], console)
+        print_best(data, by, condition, ranked_cases(data, by, condition), console)
 
 
 def ranking_text(data: SweepData, by: str, condition: str = "") -> str:
@@ -250,6 +247,17 @@ def _print_failed(data: SweepData, console: Console) -> None:
         )
 
 
+def print_best(
+    data: SweepData, by: str, condition: str, cases: np.ndarray, console: Console, agreed: str = ""
+) -> None:
+    """Print the best cases, below what they compare with and how well a linear model ranks them."""
+    name = by.removeprefix("-")
+    for text in (uncontrolled_text(data, name), agreed, f"{ranking_text(data, by, condition)}:"):
+        if text:
+            console.print(text, soft_wrap=True)
+    print_cases(data, cases, [name], console)
+
+
 def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console: Console) -> None:
     """Print `case_rows`, and any warnings."""
     if text := environments_text(data):
@@ -268,13 +276,6 @@ def ranking_warnings(data: SweepData, cases: np.ndarray, by: str) -> list[str]:
     """What must be known before acting on the cases that a metric ranks first."""
     texts = margin_warning(data, cases), resolution_warning(data, cases, by)
     return [text for text in (*texts, unranked_text(data, by)) if text]
-
-
-def print_uncontrolled(data: SweepData, by: str, console: Console) -> None:
-    """Print what the ranking metric is without control, if that is known."""
-    text = uncontrolled_text(data, by)
-    if text:
-        console.print(text, soft_wrap=True)
 
 
 def uncontrolled_text(data: SweepData, by: str) -> str:
@@ -493,14 +494,6 @@ def unit_of_metric(data: SweepData, name: str) -> str:
     if variable is not None and "pose_axis" in variable.dims:
         return "rad" if name.endswith(("[2]", "[pose_axis=3]")) else "m"
     return "" if variable is None or variable.units == "1" else variable.units
-
-
-def print_causes(data: SweepData, console: Console) -> None:
-    """Print which parameters correlate with the failures, if any do."""
-    causes = cause_rows(data)
-    if causes.rows:
-        console.print(f"what the failures depend on ({SHARES}):", soft_wrap=True)
-        print_rows(causes, console)
 
 
 def cause_rows(data: SweepData) -> Rows:

@@ -617,7 +617,7 @@ def test_the_report_tells_what_margin_costs(whole, tmp_path):
     assert f"a sweep of all {KEEP} designs that were kept" in text
     for case, row in enumerate(selection.kept.row[:3]):
         assert re.search(rf"^\| *{case} \| *{row} \|", text, re.MULTILINE)
-    costs = margin_rows(done, selection).rows
+    costs = margin_rows(done).rows
     assert [f"| {' | '.join(row)} |" in re.sub(" +", " ", text) for row in costs]
     best = [float(value.split()[0]) for _, _, value in costs]
     assert best == sorted(best) and costs[0][0] == "0" and len(costs) >= 5

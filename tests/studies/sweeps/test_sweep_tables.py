@@ -17,11 +17,13 @@ from jaxmodel import status
 from jaxmodel.metrics import METRICS
 from studies.engine import design, results
 from studies.engine.columns import axis_variables, case_variables, label_of
+from studies.engine.fidelity import Agreement
 from studies.engine.results import SweepData, metric_values
 from studies.errors import ResolutionWarning, StudyError
 from studies.results.labelled import Variable
 from studies.show.listing import Rows, print_rows
-from studies.show.pages import page
+from studies.show.pages import card, page
+from studies.show.report import Drawing
 from studies.single.run import Replay
 from studies.space.indices import elementary_effects, sobol_indices
 from studies.space.table import build_table
@@ -30,7 +32,7 @@ from studies.sweeps.documents import best_document
 from studies.sweeps.dry_run import axis_rows
 from studies.sweeps.environments import environments_text
 from studies.sweeps.explore import _figure
-from studies.sweeps.plots import _scale_ordinate, front
+from studies.sweeps.plots import MOST_LISTS, _scale_ordinate, front
 from studies.sweeps.run import make_plan
 from studies.sweeps.say import say
 from studies.sweeps.screening import check_screen, draw_screen
@@ -710,6 +712,44 @@ def test_a_report_names_links_that_no_case_controls():
     head = text_of(page(say(data))).partition("## ")[0]
     assert "case 0 with 2 µm (link_subsets = 1); link 2, which no case controls: 5 µm;" in head
     assert "largest of links 1 and 3 and all stations" in head
+
+
+def test_a_card_shows_the_first_cases_of_the_report():
+    html = card(say(usual()))
+    rows = case_rows(usual(), np.array([4, 1, 6, 0, 7, 5]), ["residual_rms"]).rows
+    (table,) = tables_of(f'<main>{html}<h2 id="versions">')[""]
+    assert [*map(list, zip(*table.values(), strict=True))] == rows
+    assert "Best by residual_rms: case 4 with 2 µm" in html and html.count("data:image") == 1
+
+
+@pytest.mark.parametrize("count", [MOST_LISTS, MOST_LISTS + 1])
+def test_a_report_lacks_figures_that_have_nothing_to_draw_over(count):
+    """Each list of placements of all links is another one."""
+    axes = {"axes": {"placement": {"kind": "per_link"}}, "method": "random", "count": count}
+    data = made_up(axes, residual_rms=of_stations(np.arange(1.0, count + 1)))
+    drawn = [part.name for part in say(data).parts if isinstance(part, Drawing)]
+    assert drawn == ["machine", "cases"][: 2 - (count > MOST_LISTS)]
+    same = usual(gain_margin=np.full(8, 3.0))
+    assert [x.name for x in say(same).parts if isinstance(x, Drawing)] == ["machine", "cases"]
+
+
+def test_blocks_within_blocks_are_told():
+    moved = {"method": "zip", "axes": {"drive.kp": [1e4, 2e4], "load.mass": [0.0, 0.1]}}
+    axes = {"gain": [k / 20 for k in range(1, 17)]}
+    data = made_up({"axes": axes, "blocks": [moved]}, residual_rms=np.ones((32, 3, 3)))
+    text = text_of(page(say(data)))
+    assert "\nEvery combination of:\n" in text and ": 0.05, 0.1, " in text
+    assert " 0.55, 0.6, ... (16 values).\n" in text
+    assert "\n- Side by side `drive.kp`: 10000.0, 20000.0; `load.mass`: 0.0, 0.1.\n" in text
+
+
+@pytest.mark.parametrize(("correlation", "is_poor"), [(0.9, False), (0.5, True)])
+def test_a_report_says_how_well_the_linear_model_ranks(correlation, is_poor):
+    data = made_up({"axes": {"gain": GAINS}, "fidelity": "linear"}, residual_rms=of_stations(RMS))
+    agreed = Agreement("residual_rms", 8, correlation, 2)
+    head = text_of(page(say(data, "DIR", agreed))).partition("**Question:**")[0]
+    assert "**All runs are of the linear model** (`sweep.fidelity`); check the best cases" in head
+    assert agreed.text in head and ("**too little to rank by**" in head) == is_poor
 
 
 def test_the_error_of_a_screen_is_a_share_of_the_full_model_s_value():
