@@ -31,8 +31,8 @@ from .study.cases import as_arrays, build_case, build_structure
 from .study.spec import Study, load_study, paper_study, parse_study
 from .study.template import write_study
 from .sweeps.plots import plot
-from .sweeps.report import write_sweep_report
 from .sweeps.run import make_plan, run_sweep
+from .sweeps.say import write_sweep_report
 from .sweeps.sensitivity import analyse
 from .sweeps.show import best_cases, table
 from .tuning.audit import audit

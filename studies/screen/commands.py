@@ -69,10 +69,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         start(precision, gpu=not workers.are_named)
         from studies.engine.progress import Phases
         from studies.extensions import options
-        from studies.screen.report import summary_lines, write_screen_report
         from studies.screen.run import PHASES, run_screen
+        from studies.screen.say import say, write_screen_report
         from studies.screen.shards import screen_of
         from studies.screen.stored import BEST
+        from studies.show.report import print_result
         from studies.show.units import count_text
         from studies.space.spec import load_sweep
 
@@ -99,14 +100,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             )
             sys.exit(130)
         if not quiet:
-            for line in summary_lines(done):
-                console.print(line, soft_wrap=True)
-            if done.n_kept:
-                console.print(
-                    f"the full model of the best: studies {options()}sweep "
-                    f"{quote(str(out / BEST))} --out DIR",
-                    soft_wrap=True,
-                )
+            report = say(done, out)
+            print_result(report, console)
+            best = f"studies {options()}sweep {quote(str(out / BEST))} --out DIR"
+            text = f"the full model of the best: {best}" if done.n_kept else report.next_steps
+            console.print(text, soft_wrap=True)
             announce(console, out / REPORT)
         if done.lost:
             print(

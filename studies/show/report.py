@@ -105,11 +105,12 @@ def machine(study: Study) -> Drawing:
 
 
 def sentence(text: str) -> str:
-    """A text with a capital and a full stop."""
+    """A text with a capital, but for names such as `residual_rms`, and a full stop."""
     start = text[:2] if text.startswith("**") else ""
     rest = text.removeprefix(start)
     closed = rest if rest.rstrip("*").endswith((".", "!", "?", ":")) else f"{rest}."
-    return start + rest[:1].upper() + closed[1:] if rest else ""
+    first = rest[:1] if "_" in rest.partition(" ")[0] else rest[:1].upper()
+    return start + first + closed[1:] if rest else ""
 
 
 def print_result(report: Report, console: Console) -> None:

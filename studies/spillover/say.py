@@ -94,7 +94,8 @@ def say(certificate: Certificate) -> Report:
         f"**{residual}**" if residual.startswith("CONTROL") else residual,
     ]
     return Report(
-        title=f"Spillover certificate {certificate.verdict}",
+        title=f"{study.title or 'untitled study'}: spillover certificate "
+        f"{'passed' if certificate.is_passed else 'failed'}",
         result=[text for text in result if text],
         question=f"""{study.title or "the study"}: is its controller stable on {plants} plants that
         differ from its nominal model, with a gain margin of {certificate.required_margin:g} on

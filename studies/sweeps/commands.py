@@ -112,7 +112,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         with Phases(console, names, quiet) as phases:
             done = run_sweep(sweep_spec, out, resume, workers=workers, phases=phases)
             if report and not done.is_interrupted:
-                from studies.sweeps.report import write_sweep_report
+                from studies.sweeps.say import write_sweep_report
 
                 phases.begin("report")
                 write_sweep_report(out)
@@ -164,7 +164,6 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         as_json: AsJson = False,
     ) -> None:
         """Show statuses and best cases of a sweep, or its failed cases."""
-        from studies.sweeps.show import print_causes
         from studies.sweeps.show import show as show_sweep
 
         data = _read(folder)
@@ -174,7 +173,6 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             print_document(show_document(data, failed))
             return
         show_sweep(data, console, failed)
-        print_causes(data, console)
 
     @app.command()
     def best(
@@ -194,16 +192,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             raise StudyError("--tolerance: for --breaks only; give both")
         if breaks:
             start()
-        from studies.engine.results import direction
-        from studies.sweeps.show import (
-            counted_text,
-            print_cases,
-            print_left_out,
-            print_uncontrolled,
-            ranked_cases,
-        )
+        from studies.sweeps.show import print_best, print_left_out, ranked_cases
 
-        data, name, agreed = _read(folder), by.removeprefix("-"), ""
+        data, agreed = _read(folder), ""
         if data.spec.sweep.fidelity == "linear":
             start()
             from studies.engine.fidelity import agreement
@@ -222,14 +213,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             document = best_document(data, by, cases, subject_to)
             print_document(document.replace(smallest_changes=changes and list(changes)))
             return
-        print_uncontrolled(data, name, console)
-        if agreed:
-            console.print(agreed, soft_wrap=True)
-        counted = counted_text(data, name)
-        console.print(
-            ", ".join(filter(None, (f"by {name}", f"{direction(by)} first", counted))) + ":"
-        )
-        print_cases(data, cases, [name], console)
+        print_best(data, by, subject_to, cases, console, agreed)
         print_left_out(data, console)
         for entry in changes or ():
             console.print(f"case {entry.case}: {entry.text}", soft_wrap=True)

@@ -33,12 +33,12 @@ from studies.study.margin import ENOUGH
 from studies.sweeps.records import BESIDE, MARGIN, is_there, reason, watched
 from studies.sweeps.sensitivity import scalar_columns
 from studies.sweeps.show import (
-    margin_warning,
+    is_ranked,
     ranked_cases,
     ranking,
+    ranking_warnings,
     recommended,
     requirement,
-    resolution_warning,
     shown_metric,
     unit_of_metric,
 )
@@ -110,17 +110,11 @@ def _about(data: SweepData) -> dict[str, str]:
 
 def _warnings(data: SweepData, rank: str) -> tuple[str, ...]:
     """What to know before acting on the best cases."""
-    try:
-        best = recommended(data, rank)  # as the page begins
-    except StudyError:  # none is ok
+    if not is_ranked(data, rank):
         return ()
     linear = "Figures are those of the linear model, drawn motions of the full one."
-    texts = (
-        linear if data.spec.sweep.fidelity == "linear" else "",
-        resolution_warning(data, best, rank),
-        margin_warning(data, best),
-    )
-    return tuple(text for text in texts if text)
+    said = ranking_warnings(data, recommended(data, rank), rank)  # as the page begins
+    return (linear, *said) if data.spec.sweep.fidelity == "linear" else tuple(said)
 
 
 def _conditions(data: SweepData, rank: str) -> dict[str, float]:

@@ -72,9 +72,7 @@ def plot(sweep: SweepData | str | Path, x: str | None, y: str, hue: str | None =
     if x is None:
         if hue is not None:
             raise StudyError("--hue: needs --x")
-        if "patches.centers" in data.variables and data["patches.centers"].ndim == 2:
-            return _placements(data, y)
-        return _parallel(data, y, chosen)
+        return _placements(data, y) if _has_placements(data) else _parallel(data, y, chosen)
     for option, name in (("--x", x), ("--hue", hue)):
         there = metric_values(data, name) if name is not None else value
         if there.dtype.kind == "f":
@@ -109,6 +107,26 @@ def plot(sweep: SweepData | str | Path, x: str | None, y: str, hue: str | None =
             if x == MARGIN:
                 ax.axvline(ENOUGH, color="black", linewidth=0.8, linestyle=":")
     return figure
+
+
+def has_axes(data: SweepData, y: str) -> bool:
+    """Whether `plot` draws a metric, which some case has, over all axes at once."""
+    cases = np.flatnonzero((data["status"] == status.OK) & np.isfinite(metric_values(data, y)))
+    return _has_placements(data) or bool(_axes(data, cases))
+
+
+def _has_placements(data: SweepData) -> bool:
+    return "patches.centers" in data.variables and data["patches.centers"].ndim == 2
+
+
+def _axes(data: SweepData, cases: np.ndarray) -> dict[str, np.ndarray]:
+    """Values of cases along each axis, of lists as texts; without axes of too many lists."""
+    axes = {}
+    for name in swept_names(data):
+        is_list = data[name].ndim > 1
+        lists = [shown_value(data, name, case) for case in cases.tolist() if is_list]
+        axes[name] = np.array(lists) if is_list else _drawn(data, name)[cases]
+    return {x: v for x, v in axes.items() if data[x].ndim == 1 or len({*v}) <= MOST_LISTS}
 
 
 def _drawn(data: SweepData, name: str) -> np.ndarray:
@@ -367,15 +385,11 @@ def _best_text(data: SweepData, count: int) -> str:
 
 def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
     """Each axis a vertical line, each case a polyline coloured by rank; the best stand out."""
-    cases, columns = np.flatnonzero(chosen).tolist(), {}
-    for name in swept_names(data):
-        is_list = data[name].ndim > 1
-        lists = np.array([shown_value(data, name, case) for case in cases if is_list])
-        columns[name] = lists if is_list else _drawn(data, name)[chosen]
-    names = [x for x in columns if data[x].ndim == 1 or len({*columns[x]}) <= MOST_LISTS]
-    if not names:
+    columns = _axes(data, np.flatnonzero(chosen))
+    if not columns:
         raise StudyError("--x: needed here, no axis of this sweep is a single number or text")
-    notes = [f"no axis for {x}: too many lists" for x in columns if x not in names]
+    names = list(columns)
+    notes = [f"no axis for {x}: too many lists" for x in swept_names(data) if x not in columns]
     value = shown_metric(data, y)[chosen]
     best = np.flatnonzero(np.isin(np.flatnonzero(chosen), recommended(data, y)))
     order = np.argsort(-value)

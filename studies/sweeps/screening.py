@@ -12,7 +12,6 @@ from studies.engine.columns import NOT_RUN
 from studies.engine.fidelity import rank_correlation
 from studies.engine.results import SweepData, direction, meets, metric_values
 from studies.engine.screen import audited, in_order
-from studies.errors import StudyError
 from studies.show import figures
 from studies.show.units import readable
 from studies.sweeps.show import label, shown_metric, unit_of_metric
@@ -128,23 +127,15 @@ def _rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def draw_screen(data: SweepData) -> Figure:
-    """The full model's values over the linear one's.
-
-    Raises:
-        StudyError: no screen, or no case to draw.
-    """
-    screen = data.spec.screen
-    if screen is None or "screen_value" not in data.variables:
-        raise StudyError("sweep.screen: none in this sweep")
-    by = screen.entry
+    """The full model's values over the linear one's, of a screen with a case of status ok."""
+    assert data.spec.screen is not None
+    by = data.spec.screen.entry
     order, value = _order(data), shown_metric(data, by)
     factor = readable(unit_of_metric(data, by))[0]
     linear = factor * data["screen_value"]
     is_fine = (data["status"] == status.OK) & np.isfinite(value) & np.isfinite(linear)
     passed = order[: _n_passed(data, order)]
     groups = [(_random(data, order), "random cases", "C1"), (passed, "passed the screen", "C0")]
-    if not is_fine.any():
-        raise StudyError("no case of status ok to draw")
     with figures.styled():
         figure, axes = figures.one_panel(4.2)
         for rows, name, colour in groups:

@@ -28,10 +28,14 @@ from studies.engine.results import (
 )
 from studies.errors import ResolutionWarning, StudyError, field_error
 from studies.show.listing import Rows, print_rows
-from studies.show.units import count_text, headed, readable, settling_text
+from studies.show.report import sentence
+from studies.show.units import count_text, headed, number, readable, settling_text
+from studies.show.words import motion_text
 from studies.study.entries import links_text
 from studies.study.margin import ENOUGH, GUESSED, margin_text
 from studies.study.resolution import is_deflection, least_step, resolution_text
+from studies.study.spec import Study
+from studies.study.window import residual_delay
 from studies.sweeps.environments import (
     design_values,
     environments_text,
@@ -47,6 +51,7 @@ from studies.sweeps.records import (
     case_records,
     failed_cases,
     failed_records,
+    is_there,
     reason,
     status_records,
     watched,
@@ -74,15 +79,6 @@ SHARES = (
     "their share in the lowest and highest quarter of a number, and at the best and worst value of "
     "a choice"
 )
-
-
-def select(data: SweepData, subject_to: str) -> np.ndarray:
-    """Cases of status ok for which a condition holds, (n,).
-
-    Raises:
-        StudyError: not a condition, or unknown names in it.
-    """
-    return (data["status"] == status.OK) & meets(data, subject_to, "--subject-to")
 
 
 def best_cases(
@@ -162,7 +158,8 @@ def ranked_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10
     value = metric_values(data, name)
     if value.dtype.kind not in "fiub":
         raise StudyError(f"--by {by}: a text, not a number")
-    chosen = np.flatnonzero(whole_designs(data, select(data, subject_to) & np.isfinite(value)))
+    is_fine = (data["status"] == status.OK) & meets(data, subject_to, "--subject-to")
+    chosen = np.flatnonzero(whole_designs(data, is_fine & np.isfinite(value)))
     of_all = "in each of its environments" if has_environments(data) else ""
     what = "design" if of_all else "case"
     if len(chosen) == 0 and subject_to:
@@ -177,27 +174,48 @@ def ranked_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10
 
 
 def show(data: SweepData, console: Console, is_failed: bool) -> None:
-    """Print an overview, or the failed cases one by one."""
+    """Print an overview, or the failed cases one by one, and what the failures depend on."""
     if is_failed:
         _print_failed(data, console)
-        return
+    else:
+        _print_overview(data, console)
+    if (causes := cause_rows(data)).rows:
+        console.print(f"what the failures depend on ({SHARES}):", soft_wrap=True)
+        print_rows(causes, console)
+
+
+def _print_overview(data: SweepData, console: Console) -> None:
     console.print(f"{data.spec.study.title}: {data.n_cases} cases, {', '.join(swept_names(data))}")
     print_rows(status_rows(data), console)
     by = ranking(data)
     if is_ranked(data, by):
         condition = requirement(data, by)
-        best = ranked_cases(data, by, condition)
-        print_uncontrolled(data, by, console)
-        met = f", of those with {condition}" if condition else ""
-        console.print(f"best cases by {by}, {direction(by)} first, {counted_text(data, by)}{met}:")
-        print_cases(data, best, [by], console)
+        print_best(data, by, condition, ranked_cases(data, by, condition), console)
+
+
+def ranking_text(data: SweepData, by: str, condition: str = "") -> str:
+    """Which cases are the best, in words."""
+    name = by.removeprefix("-")
+    met = f"of those with {condition}" if condition else ""
+    parts = f"best cases by {name}", f"{direction(by)} first", counted_text(data, name), met
+    return ", ".join(filter(None, parts))
+
+
+def runs_text(study: Study) -> str:
+    """What moves the machine and when vibration is residual, in sentences."""
+    window, delay = study.metrics.residual_length, residual_delay(study)
+    return (
+        f"{sentence(motion_text(study))} Residual window: {number(window, 's')} ms, from "
+        f"{number(delay, 's')} ms after the reference trajectory."
+    )
 
 
 def is_ranked(data: SweepData, metric: str) -> bool:
-    """Whether some case that is ok has a metric."""
-    if metric.partition("[")[0] not in data.variables:  # no run has finished
+    """Whether some case that is ok, or design whose cases are, has a metric."""
+    try:
+        return bool(len(ranked_cases(data, metric, count=1)))
+    except StudyError:
         return False
-    return bool(np.isfinite(metric_values(data, metric)[data["status"] == status.OK]).any())
 
 
 def status_rows(data: SweepData) -> Rows:
@@ -229,6 +247,17 @@ def _print_failed(data: SweepData, console: Console) -> None:
         )
 
 
+def print_best(
+    data: SweepData, by: str, condition: str, cases: np.ndarray, console: Console, agreed: str = ""
+) -> None:
+    """Print the best cases, below what they compare with and how well a linear model ranks them."""
+    name = by.removeprefix("-")
+    for text in (uncontrolled_text(data, name), agreed, f"{ranking_text(data, by, condition)}:"):
+        if text:
+            console.print(text, soft_wrap=True)
+    print_cases(data, cases, [name], console)
+
+
 def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console: Console) -> None:
     """Print `case_rows`, and any warnings."""
     if text := environments_text(data):
@@ -237,27 +266,16 @@ def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console:
     note = mark_note(data, cases, metrics[0])
     if note:
         console.print(note, soft_wrap=True)
-    if _has_margins(data):
+    if is_there(data, MARGIN):
         console.print(GUESSED, soft_wrap=True)
     for warning in ranking_warnings(data, cases, metrics[0]):
         console.print(f"[bold red]{escape(warning)}[/]", soft_wrap=True, markup=True)
-
-
-def _has_margins(data: SweepData) -> bool:
-    return MARGIN in data.variables and bool(np.isfinite(data[MARGIN]).any())
 
 
 def ranking_warnings(data: SweepData, cases: np.ndarray, by: str) -> list[str]:
     """What must be known before acting on the cases that a metric ranks first."""
     texts = margin_warning(data, cases), resolution_warning(data, cases, by)
     return [text for text in (*texts, unranked_text(data, by)) if text]
-
-
-def print_uncontrolled(data: SweepData, by: str, console: Console) -> None:
-    """Print what the ranking metric is without control, if that is known."""
-    text = uncontrolled_text(data, by)
-    if text:
-        console.print(text, soft_wrap=True)
 
 
 def uncontrolled_text(data: SweepData, by: str) -> str:
@@ -271,7 +289,7 @@ def uncontrolled_text(data: SweepData, by: str) -> str:
         return ""
     cases = metric_values(data, by)[data["status"] == status.OK]
     is_beaten = (cases < value * (1 - ROUNDING)).any()
-    text = f"{by} of the baseline without control: {_shown(data, by, value)}"
+    text = f"{by} of the baseline without control: {quantity(data, by, value)}"
     return text if is_beaten else f"{text}; no case is below it"
 
 
@@ -280,10 +298,10 @@ def mark_note(data: SweepData, cases: np.ndarray, metric: str) -> str:
     value = uncontrolled_value(data, metric)
     if value is None or not is_worse(metric_values(data, metric)[cases], value).any():
         return ""
-    return f"{MARK}: worse than the baseline without control, {_shown(data, metric, value)}"
+    return f"{MARK}: worse than the baseline without control, {quantity(data, metric, value)}"
 
 
-def _shown(data: SweepData, metric: str, value: float) -> str:
+def quantity(data: SweepData, metric: str, value: float) -> str:
     """A value of a metric in the unit that reports show."""
     factor, unit = readable(unit_of_metric(data, metric))
     return f"{factor * value:.4g} {unit}".rstrip()
@@ -322,9 +340,7 @@ def unranked_text(data: SweepData, by: str) -> str:
 
 def margin_warning(data: SweepData, cases: np.ndarray) -> str:
     """Warning if cases have a gain margin below `ENOUGH`, "" if none has."""
-    margin = np.full(len(cases), np.nan)
-    if MARGIN in data.variables:
-        margin = design_values(data, MARGIN)[cases]
+    margin = design_values(data, MARGIN)[cases] if MARGIN in data.variables else np.array([])
     low = int(np.sum(margin < ENOUGH))
     if not low:
         return ""
@@ -444,7 +460,7 @@ def requirement(data: SweepData, by: str, is_safe: bool = True) -> str:
         As much of that, as a condition, as any case with this metric meets; "" for nothing.
     """
     own = data.spec.screen.subject_to if data.spec.screen is not None else ""
-    is_safe = is_safe and _has_margins(data)
+    is_safe = is_safe and is_there(data, MARGIN)
     conditions = [x for x in (own, f"{MARGIN} >= {ENOUGH:g}" if is_safe else "") if x]
     for condition in dict.fromkeys((" and ".join(map(_bracket, conditions)), *conditions)):
         try:
@@ -478,14 +494,6 @@ def unit_of_metric(data: SweepData, name: str) -> str:
     if variable is not None and "pose_axis" in variable.dims:
         return "rad" if name.endswith(("[2]", "[pose_axis=3]")) else "m"
     return "" if variable is None or variable.units == "1" else variable.units
-
-
-def print_causes(data: SweepData, console: Console) -> None:
-    """Print which parameters correlate with the failures, if any do."""
-    causes = cause_rows(data)
-    if causes.rows:
-        console.print(f"what the failures depend on ({SHARES}):", soft_wrap=True)
-        print_rows(causes, console)
 
 
 def cause_rows(data: SweepData) -> Rows:

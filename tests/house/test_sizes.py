@@ -83,7 +83,7 @@ OTHERS = {
     "studies/spillover/proofs.py": (":3",),
     "studies/study/state_space.py": (":3",),
     "studies/study/window.py": ("np.zeros((study.n_links, 2, 3))", "range(3)"),
-    "studies/sweeps/report.py": (":3", "len(best) > 3", "len(fine) < 3"),
+    "studies/sweeps/say.py": (":3", "len(best) > 3", "len(fine) >= 3"),
     "studies/sweeps/screening.py": ("min((len(np.unique(x)) for x in (a, b))) < 3",),
     "studies/tuning/evaluate.py": ("3:",),
     "studies/twin/electronics.py": (":3", "np.zeros((3, *shape))"),

@@ -20,10 +20,10 @@ from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import run_uncontrolled
 from studies.errors import StudyError
 from studies.results.labelled import Variable
-from studies.screen import report, selection, shards
+from studies.screen import say, selection, shards
 from studies.screen.local import LocalScreener
-from studies.screen.report import margin_rows, quantile_rows, summary_lines, write_screen_report
 from studies.screen.run import run_screen
+from studies.screen.say import margin_rows, quantile_rows, summary_lines, write_screen_report
 from studies.screen.selection import select
 from studies.screen.shards import axis_columns, screen_of
 from studies.screen.stored import BEST, TALLY, best_sweep, read_tally, write_tally
@@ -332,7 +332,8 @@ def test_nothing_is_kept_where_no_design_has_the_margin(whole, tmp_path):
     assert "none has a gain margin of at least 60 (largest: " in summary_lines(none)[-3]
     write_screen_report(tmp_path, none)
     text = text_of((tmp_path / "report.html").read_text())
-    assert "None of these is kept: they lack the margin." in text and "Next steps" not in text
+    assert "None of these is kept: they lack the margin." in text
+    assert "**Next steps:** ask for less with `--resume --margin`, or narrow the axes." in text
 
 
 def test_the_same_links_count_for_all_designs(tmp_path):
@@ -406,7 +407,7 @@ def test_margins_below_one_have_no_negative_counts(whole, tmp_path):
 
 def test_candidates_that_end_before_enough_are_found_are_told(whole, monkeypatch):
     _, done = whole
-    monkeypatch.setattr(report, "CANDIDATES", len(done.tally.row))
+    monkeypatch.setattr(say, "CANDIDATES", len(done.tally.row))
     few = done._replace(screen=done.screen._replace(margin=60.0, keep=1000))
     for is_kept in (done.selection.is_kept, np.zeros(KEEP, bool)):
         told = few._replace(selection=done.selection._replace(is_kept=is_kept))
@@ -616,7 +617,7 @@ def test_the_report_tells_what_margin_costs(whole, tmp_path):
     assert f"a sweep of all {KEEP} designs that were kept" in text
     for case, row in enumerate(selection.kept.row[:3]):
         assert re.search(rf"^\| *{case} \| *{row} \|", text, re.MULTILINE)
-    costs = margin_rows(done)
+    costs = margin_rows(done).rows
     assert [f"| {' | '.join(row)} |" in re.sub(" +", " ", text) for row in costs]
     best = [float(value.split()[0]) for _, _, value in costs]
     assert best == sorted(best) and costs[0][0] == "0" and len(costs) >= 5
@@ -676,8 +677,8 @@ def test_a_report_of_values_that_a_log_scale_lacks(whole, tmp_path):
         screen=done.screen._replace(by=f"-{done.screen.by}"),
         tally=done.tally._replace(value=done.tally.value[::-1]),
     )
-    assert [share for share, _ in quantile_rows(largest)] == ["1 %", "10 %", "50 %", "90 %"]
-    least, most = quantile_rows(done), quantile_rows(largest)
+    assert [share for share, _ in quantile_rows(largest).rows] == ["1 %", "10 %", "50 %", "90 %"]
+    least, most = quantile_rows(done).rows, quantile_rows(largest).rows
     assert least[-1][1].replace("less", "more") == most[1][1]  # 90 % are below, 10 % above
 
 

@@ -12,10 +12,11 @@ from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import _simulate
 from studies.errors import StudyError
+from studies.show.pages import page
 from studies.space.table import build_table
 from studies.study.cases import as_arrays, build_case, build_structure
-from studies.sweeps.report import report, write_sweep_report
 from studies.sweeps.run import make_plan, run_sweep
+from studies.sweeps.say import say, write_sweep_report
 from studies.sweeps.screening import _rank_correlation, check_screen
 from studies.sweeps.show import ranked_cases, recommended
 from tests.bare import paper_study, parse_sweep
@@ -193,7 +194,7 @@ def test_linear_runs_are_judged_like_others(folders):
     assert 0 < np.nanmax(np.abs(other / value - 1)) < 0.05  # 2 mm in 10 ms
     rms, without = (data.baseline["residual_rms"].data for data in (full, linear))
     assert 1e-3 < np.abs(without / rms - 1).max() < 0.1  # and so for the run without control
-    assert "All runs are of the linear model" in text_of(report(linear, "residual_rms", []))
+    assert "All runs are of the linear model" in text_of(page(say(linear)))
 
 
 @pytest.mark.parametrize("sorts", ["few", pytest.param("all", marks=pytest.mark.long)])
@@ -260,7 +261,7 @@ def test_a_condition_sends_the_screen_further_down(tmp_path, folders):
     run(screened(subject_to=f"{ENDS} < 0"), tmp_path / "none")  # runs all there are
     write_sweep_report(tmp_path / "none")
     report = text_of((tmp_path / "none" / "report.html").read_text(encoding="utf-8"))
-    assert f"None of them meets {ENDS} < 0" in report and "best by residual_rms: case" in report
+    assert f"None of them meets {ENDS} < 0" in report and "Best by residual_rms: case" in report
     found = read(tmp_path / "none")
     np.testing.assert_array_equal(found["status"] >= 0, found["screen_status"] == status.OK)
 

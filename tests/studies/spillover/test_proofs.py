@@ -596,7 +596,7 @@ def test_an_unstable_machine_of_the_box_fails_a_design_whose_plants_pass(near):
     assert data["fails_from"] == 0
     words = " ".join(text_of(page(say(failed))).split())
     first = words[: words.index("**Question:**")]
-    assert f"certificate {failed.verdict}" in first
+    assert "certificate failed" in first
     assert "2 of 2 plants pass" in words
     assert f"**Failed by an unstable machine in the box: {machine}; on the plants" in first
     assert "until `--prove` finds no unstable machine" in words and "studies export" not in words

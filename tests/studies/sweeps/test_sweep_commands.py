@@ -20,10 +20,11 @@ from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import run_study
 from studies.errors import StudyError
 from studies.explorer.replays import rows_to_replay
+from studies.show.pages import page as make_page
 from studies.study.consistency import patch_centers
 from studies.study.template import toml_value
 from studies.sweeps import explore
-from studies.sweeps.report import report
+from studies.sweeps.say import say
 from tests import canonical
 from tests.canonical import MACHINE
 from tests.pages import about, parsed, text_of, unpacked
@@ -224,8 +225,8 @@ def check_report(folder):
     code, gain = data["status"], data["control.gain_factor"]
     count = int(np.sum(code == 0))
     for part in (
-        "- 8 base points of a Saltelli design of",
-        "\n  - `gain` (`control.gain_factor`): 0.05 to 1, log scale",
+        "\n8 base points of a Saltelli design of:\n",
+        "\n- `gain` (`control.gain_factor`): 0.05 to 1, log scale.",
         "40 cases.",
         "| drive.kp | N/m |",
         f"| ok | {count} | {count / 0.4:.1f} |",
@@ -237,7 +238,7 @@ def check_report(folder):
     assert 10 < count < 40
     value = np.where(safe, np.nanmax(data["residual_rms"], axis=(1, 2)), np.inf)
     first = (
-        f"**Result:** best by residual_rms: case {np.argmin(value)} with {1e6 * value.min():.4g} µm"
+        f"**Result:** Best by residual_rms: case {np.argmin(value)} with {1e6 * value.min():.4g} µm"
     )
     head = text.partition("## ")[0]
     assert first in head and "40 cases of control.gain_factor, drive.kp, patches.cent" in head
@@ -245,18 +246,19 @@ def check_report(folder):
     rows = [int(k) for k in re.findall(r"(?m)^\| (\d+) ", best)]
     assert rows == np.argsort(value, kind="stable")[: min(count, 10)].tolist()
 
-    def told(code, drawn):
+    def told(code):
         changed = {**data.variables, "status": data.variables["status"]._replace(data=code)}
         changed = dataclasses.replace(data, variables=changed)
-        return text_of(report(changed, "residual_rms", drawn))
+        return text_of(make_page(say(changed)))
 
     loud = int(np.sum(gain > 0.5))
-    text = told(np.where(gain > 0.5, 4, 0), ["cases.png"])
+    text = told(np.where(gain > 0.5, 4, 0))
     assert 0 < loud < 40 and f"| non-finite number | {loud} | {loud / 0.4:.1f} |" in text
     first = text.partition("## What the failures depend on")[2].split("\n| ")[2]
     assert first.startswith("control.gain_factor | 1.00 |") and "| 0 % (<=" in first
-    text = told(np.full(40, 4), [])
-    assert "No case of status ok has it." in text and "![" not in text
+    text = told(np.full(40, 4))
+    assert "**Result:** No case has residual_rms. 0 of 40 cases ended ok (40: non-finite" in text
+    assert re.findall(r"!\[(\w+)\]", text) == ["machine"]
     assert (
         "## What the failures depend on" not in text
     )  # where nothing is ok there is nothing to compare

@@ -17,10 +17,13 @@ from jaxmodel import status
 from jaxmodel.metrics import METRICS
 from studies.engine import design, results
 from studies.engine.columns import axis_variables, case_variables, label_of
+from studies.engine.fidelity import Agreement
 from studies.engine.results import SweepData, metric_values
 from studies.errors import ResolutionWarning, StudyError
 from studies.results.labelled import Variable
 from studies.show.listing import Rows, print_rows
+from studies.show.pages import card, page
+from studies.show.report import Drawing
 from studies.single.run import Replay
 from studies.space.indices import elementary_effects, sobol_indices
 from studies.space.table import build_table
@@ -29,9 +32,9 @@ from studies.sweeps.documents import best_document
 from studies.sweeps.dry_run import axis_rows
 from studies.sweeps.environments import environments_text
 from studies.sweeps.explore import _figure
-from studies.sweeps.plots import _scale_ordinate, front
-from studies.sweeps.report import report
+from studies.sweeps.plots import MOST_LISTS, _scale_ordinate, front
 from studies.sweeps.run import make_plan
+from studies.sweeps.say import say
 from studies.sweeps.screening import check_screen, draw_screen
 from studies.sweeps.sensitivity import analyse, failure_causes
 from studies.sweeps.show import (
@@ -502,7 +505,7 @@ def test_cases_worse_than_no_control_are_marked(printed):
     text = printed(data, "best", "DIR", "--by", "residual_rms", "--count", "5")
     assert f"{told}\n" in text and note not in text
     assert f"{told}\n" in printed(data, "show", "DIR")
-    text = text_of(report(data, "residual_rms", []))
+    text = text_of(page(say(data)))
     assert f"; {told}." in text.partition("## ")[0] and f"\n{note}" in text
     assert "without control" not in printed(data, "best", "DIR", "--by", "gain_margin")
     for by, value in (("residual_rms[link=3]", "4 µm"), ("residual_rms[0][2]", "4 µm")):
@@ -537,7 +540,7 @@ def test_deflections_below_one_adc_step_are_not_ranked_in_silence(printed):
     assert text in printed(data, "best", "DIR", "--by", "residual_rms")
     shown = text.replace("2 of these 8 cases are", "1 of these 7 cases is")  # of the safe ones
     assert shown in printed(data, "show", "DIR")
-    assert text_of(report(data, "residual_rms", [])).partition("## ")[0].count(shown) == 1
+    assert text_of(page(say(data))).partition("## ")[0].count(shown) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for by in ("-residual_rms", "gain_margin", "peak_voltage", "settling_time"):
@@ -653,9 +656,10 @@ def test_an_outlier_of_many_cases_is_counted_instead_of_shown():
 
 def test_the_head_of_a_report_says_what_the_data_say():
     data = usual(codes=[0, 0, 0, 0, 0, 0, 0, 4])
-    text = text_of(report(data, "residual_rms", [], "DIR"))
+    text = text_of(page(say(data)))
     head = text.partition("## ")[0]
-    assert "8 cases of control.gain_factor, ranked by residual_rms (smallest first;" in head
+    ranked = "best cases by residual_rms, smallest first, largest of all links and all stations"
+    assert f"Which of 8 cases of control.gain_factor are the {ranked}, of those with" in head
     assert "7 of 8 cases ended ok (1: non-finite number)." in head
     # of 5, 3, 8, 1, 2, 7, 4 um the median is 4 and the mean 4.286
     assert "the median of the ok cases is 4 µm." in head
@@ -669,7 +673,7 @@ def test_the_head_of_a_report_says_what_the_data_say():
 
 def test_the_tables_of_a_report_are_those_of_the_data():
     data = usual(codes=[0, 0, 0, 0, 0, 0, 0, 4])
-    found = tables_of(report(data, "residual_rms", [], "DIR"))
+    found = tables_of(page(say(data)))
     best = case_rows(data, np.array([4, 1, 6, 0, 5, 2]), ["residual_rms"])
     wanted = {
         "Best cases by residual_rms": best,
@@ -686,27 +690,66 @@ def test_the_tables_of_a_report_are_those_of_the_data():
 
 def test_a_report_names_what_does_not_tell_cases_apart():
     rms = of_stations(1e-6 * (1 + 1e-3 * np.arange(8)))
-    text = text_of(report(usual(residual_rms=rms), "residual_rms", [], "DIR"))
+    text = text_of(page(say(usual(residual_rms=rms))))
     # seven cases have a margin of 2, without the fourth
-    assert "**The 7 best differ by only 0.7 %: residual_rms does not distinguish them;" in text
-    wide = text_of(report(usual(residual_rms=rms**30), "residual_rms", [], "DIR"))
+    assert "**The 7 best differ by only 0.7 %: residual_rms does not distinguish them; rank" in text
+    wide = text_of(page(say(usual(residual_rms=rms**30))))
     assert "differ by only" not in wide
 
 
 def test_a_report_warns_where_no_margin_is_enough():
     data = usual(gain_margin=np.linspace(1.1, 1.8, 8))
-    text = text_of(report(data, "residual_rms", [], "DIR"))
+    text = text_of(page(say(data)))
     assert "**CAUTION: 8 of these 8 cases have a gain margin below 2 (smallest 1.1);" in text
     assert "case 3 with 1 µm (control.gain_factor = 0.4), gain margin 1.4 (2.9 dB);" in text
-    assert "Regardless" not in text and "Cases of status ok, smallest residual_rms first." in text
+    ranked = "best cases by residual_rms, smallest first, largest of all links and all stations?"
+    assert "Regardless" not in text and ranked in text
 
 
 def test_a_report_names_links_that_no_case_controls():
     rms = np.ones((2, 3, 3)) * 1e-6 * np.array([[[2.0], [5.0], [1.0]], [[1.0], [7.0], [3.0]]])
     data = made_up({"link_subsets": ["1", "1+3"]}, residual_rms=rms)
-    head = text_of(report(data, "residual_rms", [], "DIR")).partition("## ")[0]
+    head = text_of(page(say(data))).partition("## ")[0]
     assert "case 0 with 2 µm (link_subsets = 1); link 2, which no case controls: 5 µm;" in head
     assert "largest of links 1 and 3 and all stations" in head
+
+
+def test_a_card_shows_the_first_cases_of_the_report():
+    html = card(say(usual()))
+    rows = case_rows(usual(), np.array([4, 1, 6, 0, 7, 5]), ["residual_rms"]).rows
+    (table,) = tables_of(f'<main>{html}<h2 id="versions">')[""]
+    assert [*map(list, zip(*table.values(), strict=True))] == rows
+    assert "Best by residual_rms: case 4 with 2 µm" in html and html.count("data:image") == 1
+
+
+@pytest.mark.parametrize("count", [MOST_LISTS, MOST_LISTS + 1])
+def test_a_report_lacks_figures_that_have_nothing_to_draw_over(count):
+    """Each list of placements of all links is another one."""
+    axes = {"axes": {"placement": {"kind": "per_link"}}, "method": "random", "count": count}
+    data = made_up(axes, residual_rms=of_stations(np.arange(1.0, count + 1)))
+    drawn = [part.name for part in say(data).parts if isinstance(part, Drawing)]
+    assert drawn == ["machine", "cases"][: 2 - (count > MOST_LISTS)]
+    same = usual(gain_margin=np.full(8, 3.0))
+    assert [x.name for x in say(same).parts if isinstance(x, Drawing)] == ["machine", "cases"]
+
+
+def test_blocks_within_blocks_are_told():
+    moved = {"method": "zip", "axes": {"drive.kp": [1e4, 2e4], "load.mass": [0.0, 0.1]}}
+    axes = {"gain": [k / 20 for k in range(1, 17)]}
+    data = made_up({"axes": axes, "blocks": [moved]}, residual_rms=np.ones((32, 3, 3)))
+    text = text_of(page(say(data)))
+    assert "\nEvery combination of:\n" in text and ": 0.05, 0.1, " in text
+    assert " 0.55, 0.6, ... (16 values).\n" in text
+    assert "\n- Side by side `drive.kp`: 10000.0, 20000.0; `load.mass`: 0.0, 0.1.\n" in text
+
+
+@pytest.mark.parametrize(("correlation", "is_poor"), [(0.9, False), (0.5, True)])
+def test_a_report_says_how_well_the_linear_model_ranks(correlation, is_poor):
+    data = made_up({"axes": {"gain": GAINS}, "fidelity": "linear"}, residual_rms=of_stations(RMS))
+    agreed = Agreement("residual_rms", 8, correlation, 2)
+    head = text_of(page(say(data, "DIR", agreed))).partition("**Question:**")[0]
+    assert "**All runs are of the linear model** (`sweep.fidelity`); check the best cases" in head
+    assert agreed.text in head and ("**too little to rank by**" in head) == is_poor
 
 
 def test_the_error_of_a_screen_is_a_share_of_the_full_model_s_value():

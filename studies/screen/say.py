@@ -1,40 +1,38 @@
-"""The page of a screen, and its summary: the best designs, and what the others were like."""
+"""What a screen tells: the best designs, and what the others were like."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from shlex import quote
-from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from jaxmodel import status
 from studies.engine.results import ROUNDING
 from studies.extensions import options
-from studies.publish import REPORT, publish
+from studies.publish import publish
 from studies.screen.plots import axis_head, described, entry_unit, influence, values
 from studies.screen.run import ScreenOutcome, all_failed
 from studies.screen.selection import Selection
 from studies.screen.shards import CANDIDATES, ScreenRequest, axis_columns
 from studies.screen.stored import BEST
 from studies.screen.tally import LEFT_OUT, quantile
-from studies.show.figures import styled
-from studies.show.pages import old_page as page
+from studies.show.listing import Rows
+from studies.show.pages import write_report
+from studies.show.report import Chapter, Drawing, Report, chapter
 from studies.show.units import count_text, headed, readable
-from studies.show.words import motion_text
 from studies.study.margin import margin_text
 from studies.study.template import toml_text
-from studies.sweeps.plots import save_plot
-from studies.sweeps.show import counted_text
+from studies.sweeps.show import counted_text, quantity, runs_text, short_value
 
-VALUES, INFLUENCE = "values.png", "influence.png"
 #: What statuses of a screen do not say.
 LATER = (
     " (what saturated or clipped may have an unstable loop: stability is judged later, of the best "
     "that are ok)"
 )
+#: Why designs did not run.
+DROPPED = "left out by sweep.where, or the same as another"
 #: Shares of the designs whose quantiles are shown.
 SHARES = (0.0001, 0.01, 0.1, 0.5, 0.9)
 #: Designs in the table.
@@ -47,37 +45,63 @@ LEAST_INTERVALS = 5
 LEAST_MARGINS = (0, 1, 1.5, 2, 3, 4, 6, 10)
 
 
-def quantity(done: ScreenOutcome, value: float) -> str:
+def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
+    """Write `report.html` and its figures into a screen's folder.
+
+    Raises:
+        StudyError: a file cannot be written.
+    """
+    with publish(folder, stale=("values.png", "influence.png")) as staging:
+        write_report(say(done, folder), staging)
+
+
+def say(done: ScreenOutcome, folder: Path = Path()) -> Report:
+    """What a screen tells; folder: its own, in commands."""
+    spec, shards = done.screen.spec, count_text(done.screen.n_shards, "shard")
+    lost = f"**Of {shards}, {len(done.lost)} left out; retry with `--resume`.**"
+    return Report(
+        title=f"{spec.study.title or 'untitled study'}: screen",
+        result=summary_lines(done),
+        question=_question(done.screen),
+        next_steps=_next_steps(done, folder),
+        top=[lost if done.lost else "", *_drawings(done)],
+        chapters=[
+            _best(done),
+            chapter("What margin costs", margin_rows(done)),
+            chapter("How the designs ended", ending_rows(done)),
+            chapter("Quantiles", quantile_rows(done)),
+        ],
+        files={"Sweep file": toml_text(spec.data), "Study of all designs": spec.study},
+    )
+
+
+def _value(done: ScreenOutcome, value: float) -> str:
     """A value of the metric with its unit, as people read it."""
-    factor, unit = readable(entry_unit(done.screen))
-    return f"{factor * value:.4g}" + ("" if unit in ("", "1") else f" {unit}")
+    return quantity(described(done.screen), done.screen.entry, value)
 
 
-def ending_rows(done: ScreenOutcome) -> list[tuple[str, str, str]]:
+def ending_rows(done: ScreenOutcome) -> Rows:
     """How the designs ended: number, share and reason, most frequent first."""
-    endings, rows = done.tally.endings, []
-    for code in np.argsort(-endings, kind="stable"):
-        if endings[code]:
-            reason = (
-                "left out by sweep.where, or the same as another"
-                if code == LEFT_OUT
-                else status.REASONS[code]
-            )
-            share = f"{100 * endings[code] / done.tally.n_designs:.3g} %"
-            rows.append((f"{endings[code]:,}", share, reason))
-    return rows
+    endings, reasons = done.tally.endings, {**status.REASONS, LEFT_OUT: DROPPED}
+    rows = [
+        [f"{endings[k]:,}", f"{100 * endings[k] / done.tally.n_designs:.3g} %", reasons[int(k)]]
+        for k in np.argsort(-endings, kind="stable")
+        if endings[k]
+    ]
+    return Rows(["designs", "share", "ending"], rows)
 
 
-def quantile_rows(done: ScreenOutcome) -> list[tuple[str, str]]:
+def quantile_rows(done: ScreenOutcome) -> Rows:
     """Quantiles of the metric over all designs that ended well, best first, exact within 1 %."""
     sketch, is_largest = done.tally.sketch[0], done.screen.ranking[1]
     bound = "more" if is_largest else "less"
     rows = []
     for share in SHARES:
         if share * sketch.sum() >= 1:
-            value = quantity(done, clipped_quantile(done, share))
-            rows.append((f"{100 * share:g} %", f"{value} or {bound}"))
-    return rows
+            value = _value(done, clipped_quantile(done, share))
+            rows.append([f"{100 * share:g} %", f"{value} or {bound}"])
+    which = "share of the designs that ended well, unstable ones included"
+    return Rows([which, f"{done.screen.entry}, exact within 1 %"], rows)
 
 
 def clipped_quantile(done: ScreenOutcome, share: float) -> float:
@@ -93,7 +117,7 @@ def summary_lines(done: ScreenOutcome) -> list[str]:
     tally, screen = done.tally, done.screen
     lines = [
         f"{tally.n_designs:,} designs: "
-        + "; ".join(f"{number} {reason}" for number, _, reason in ending_rows(done))
+        + "; ".join(f"{number} {reason}" for number, _, reason in ending_rows(done).rows)
     ]
     if tally.endings[[status.SATURATED, status.CLIPPED]].any():
         lines[0] += LATER
@@ -105,7 +129,7 @@ def summary_lines(done: ScreenOutcome) -> list[str]:
             return [*lines, "nothing is kept"]
         advice = all_failed(tally)
         return [*lines, "no design ended well; nothing is kept" + (advice and f": {advice}")]
-    half = quantity(done, clipped_quantile(done, 0.5))
+    half = _value(done, clipped_quantile(done, 0.5))
     half += " or less" if tally.value.min() < 0 else ""  # negative values count as 0
     lines += _selection_lines(done, done.selection, half)
     agreed = [] if done.agreement is None else [done.agreement.text]
@@ -120,8 +144,8 @@ def _selection_lines(done: ScreenOutcome, selection: Selection, half: str) -> li
         best, last = selection.kept_value[[0, -1]]
         which = f" with a gain margin of at least {screen.margin:g}" if screen.margin else ""
         lines.append(
-            f"the best {done.n_kept:,}{which} by {screen.entry}: {quantity(done, best)} to "
-            f"{quantity(done, last)}; median of those that are ok: {half}"
+            f"the best {done.n_kept:,}{which} by {screen.entry}: {_value(done, best)} to "
+            f"{_value(done, last)}; median of those that are ok: {half}"
         )
         first = margin[selection.is_kept][0]
         what = "no sampled loop" if np.isnan(first) else f"a gain margin of {margin_text(first)}"
@@ -142,7 +166,7 @@ def _selection_lines(done: ScreenOutcome, selection: Selection, half: str) -> li
         largest = margin_text(np.nanmax(margin)) if np.isfinite(margin).any() else "none"
         lines.append(
             f"none has a gain margin of at least {screen.margin:g} (largest: {largest}), and "
-            "nothing is kept; ask for less with --resume --margin, or narrow the axes"
+            "nothing is kept"
         )
     if done.n_kept < screen.keep and screen.margin and len(done.tally.row) >= CANDIDATES:
         lines.append(
@@ -168,16 +192,18 @@ def _edge_lines(done: ScreenOutcome, selection: Selection) -> list[str]:
     return [f"most of these are at {' and '.join(ends)}: widen it if you can"] if ends else []
 
 
-def margin_rows(done: ScreenOutcome) -> list[tuple[str, str, str]]:
+def margin_rows(done: ScreenOutcome) -> Rows:
     """What more margin costs: margins, how many judged candidates have them, and the best one."""
+    rows: list[list[str]] = []
     if done.selection is None:
-        return []
-    margin, value, rows = done.selection.margin, done.selection.value, []
+        return Rows([], rows)
     for least in LEAST_MARGINS:
-        enough = np.flatnonzero(margin >= least)
+        enough = np.flatnonzero(done.selection.margin >= least)
         if len(enough):
-            rows.append((f"{least:g}", f"{len(enough):,}", quantity(done, value[enough[0]])))
-    return rows
+            best = _value(done, done.selection.value[enough[0]])
+            rows.append([f"{least:g}", f"{len(enough):,}", best])
+    heads = ["gain margin of at least", "candidates judged", f"best {done.screen.entry}"]
+    return Rows(heads, rows)
 
 
 def _uncontrolled_line(done: ScreenOutcome) -> list[str]:
@@ -187,7 +213,7 @@ def _uncontrolled_line(done: ScreenOutcome) -> list[str]:
     sign = -1 if done.screen.ranking[1] else 1
     model = done.screen.spec.sweep.fidelity
     text = f"{done.screen.entry} of the baseline without control, by the {model} model: "
-    text += quantity(done, done.uncontrolled)
+    text += _value(done, done.uncontrolled)
     assert done.selection is not None
     kept = done.selection.kept_value
     n_worse = int(np.sum(sign * (done.uncontrolled - kept) <= ROUNDING * abs(done.uncontrolled)))
@@ -197,82 +223,73 @@ def _uncontrolled_line(done: ScreenOutcome) -> list[str]:
     return [text]
 
 
-def write_screen_report(folder: Path, done: ScreenOutcome) -> None:
-    """Write `report.html` and its figures into a screen's folder.
-
-    Raises:
-        StudyError: a file cannot be written.
-    """
-    screen, tally = done.screen, done.tally
-    drawings: dict[str, Callable[[ScreenOutcome], Figure]] = {}
-    if tally.sketch[0, 1:].any():  # what is drawn on a log scale
-        drawings[VALUES] = values
-        if screen.axes.names:
-            drawings[INFLUENCE] = influence
-    rows = [] if done.selection is None else _best_rows(done)
-    with publish(folder, stale=(VALUES, INFLUENCE)) as staging:
-        with styled():
-            for name, draw in drawings.items():
-                save_plot(draw(done), staging / name)
-        text = page(
-            "screen/report.html",
-            staging,
-            {"Sweep file": toml_text(screen.spec.data), "Study of all designs": screen.spec.study},
-            title=screen.spec.study.title,
-            command=f"studies {options()}",
-            path=quote(str(folder / BEST)),
-            best=BEST,
-            screen=screen,
-            summary=[line[0].upper() + line[1:] for line in summary_lines(done)],
-            drawn=list(drawings),
-            endings=ending_rows(done),
-            quantiles=quantile_rows(done),
-            heads=_heads(screen),
-            rows=rows,
-            n_kept=done.n_kept,
-            condition=_condition(done),
-            margins=margin_rows(done),
-            motion=motion_text(screen.spec.study),
-            window=screen.spec.study.metrics,
-            counted=counted_text(described(screen), screen.entry),
-            is_compared=done.uncontrolled is not None,
-            lost=done.lost,
-        )
-        (staging / REPORT).write_text(text, encoding="utf-8")
+def _question(screen: ScreenRequest) -> str:
+    which = "largest" if screen.by.startswith("-") else "best"
+    by = " by the linear model" if screen.spec.sweep.fidelity == "linear" else ""
+    margin = f", and a gain margin of at least {screen.margin:g}" if screen.margin else ""
+    return f"""which of {screen.n_designs:,} designs have the {which} {screen.entry}
+    ({counted_text(described(screen), screen.entry)}){by}{margin}? {runs_text(screen.spec.study)}
+    Baseline: the study of the sweep file, without the values of the axes."""
 
 
-def _condition(done: ScreenOutcome) -> str:
-    """What `studies best` asks of designs like these, "" for nothing."""
-    if not done.screen.margin or done.selection is None or np.isnan(done.selection.margin).any():
-        return ""
-    return f"gain_margin >= {done.screen.margin}"
+def _next_steps(done: ScreenOutcome, folder: Path) -> str:
+    command, screen = f"studies {options()}", done.screen
+    if done.selection is None:
+        return "look for axes along which designs end well."
+    if not done.n_kept:
+        return "ask for less with `--resume --margin`, or narrow the axes."
+    has_all = bool(screen.margin) and not np.isnan(done.selection.margin).any()
+    subject = f' --subject-to "gain_margin >= {screen.margin}"' if has_all else ""
+    return f"""`{command}sweep {quote(str(folder / BEST))} --out DIR --report` runs the designs that
+    were kept by the full model; `{command}best DIR --by '{screen.by}'{subject}` lists the best of
+    them; `{command}spillover DIR --case K` asks whether the margin holds on machines that differ
+    from the model. If it does not, ask this screen for more with `--resume --margin`: no design
+    runs again."""
 
 
-def _heads(screen: ScreenRequest) -> tuple[str, ...]:
-    names = (axis_head(name) for name in screen.axes.names)
-    return ("case", "design", headed(screen.entry, entry_unit(screen)), "gain margin", *names)
+def _drawings(done: ScreenOutcome) -> list[Drawing]:
+    """The figures, if there are values that a log scale has."""
+    if not done.tally.sketch[0, 1:].any():
+        return []
+    baseline = "" if done.uncontrolled is None else "; dashed: the baseline without control"
+    by_value = f"""Designs that ended well by value, unstable ones included; line: the last one that
+    was kept{baseline}"""
+    by_axis = """Values of the designs that ended well by interval of every axis, unstable ones
+    included: the median and, of enough designs, the best 10 % and the best 0.1 %. Where few end
+    well, they differ in more than this axis"""
+    drawn = [Drawing("values", by_value, partial(values, done))]
+    if done.screen.axes.names:
+        drawn.append(Drawing("influence", by_axis, partial(influence, done)))
+    return drawn
 
 
-def _best_rows(done: ScreenOutcome) -> list[tuple[str, ...]]:
+def _best(done: ScreenOutcome) -> Chapter | None:
+    if done.selection is None:
+        return None
+    cases = "None of these is kept: they lack the margin."
+    if done.n_kept:
+        cases = f"""Cases are those of `{BEST}`, a sweep of all {done.n_kept:,} designs that were
+        kept, with the same ids."""
+    text = f"{cases} Designs are rows of the sweep that was screened. Both count from 0."
+    return chapter("The best designs", text, _best_rows(done, done.selection))
+
+
+def _best_rows(done: ScreenOutcome, selection: Selection) -> Rows:
     """The first cases that are kept; of all candidates, if none is."""
-    selection = done.selection
-    assert selection is not None
-    factor = readable(entry_unit(done.screen))[0]
+    screen, unit = done.screen, entry_unit(done.screen)
     is_shown = selection.is_kept if done.n_kept else np.ones(len(selection.value), bool)
     shown = np.flatnonzero(is_shown)[:SHOWN]
     table = selection.table.rows(shown)
     columns = axis_columns(table)
-    return [
-        (
+    rows = [
+        [
             str(case) if done.n_kept else "",
             str(table.row[case]),
-            f"{factor * selection.value[k]:.4g}",
+            f"{readable(unit)[0] * selection.value[k]:.4g}",
             margin_text(selection.margin[k]),
-            *(_shown(columns[name][case]) for name in done.screen.axes.names),
-        )
+            *(short_value(columns[name][case]) for name in screen.axes.names),
+        ]
         for case, k in enumerate(shown)
     ]
-
-
-def _shown(value: Any) -> str:
-    return str(value) if isinstance(value, str) else f"{value:.4g}"
+    heads = ["case", "design", headed(screen.entry, unit), "gain margin"]
+    return Rows([*heads, *map(axis_head, screen.axes.names)], rows)
