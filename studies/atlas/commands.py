@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from studies.config import start
+from studies.options import Case, Out, Pdf, Quiet, Resume
 from studies.publish import REPORT, announce
 
 
@@ -18,25 +19,20 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
     @app.command()
     def atlas(
-        out: Annotated[Path, typer.Option(help="folder for data, figures and report")],
+        out: Out,
         design: Annotated[
             Path | None,
             typer.Argument(
                 help="study file, folder of a tuning or a sweep; default: the paper's design"
             ),
         ] = None,
-        case: Annotated[
-            str | None,
-            typer.Option(help="case of a sweep (number or id:...) or family of a tuning"),
-        ] = None,
-        resume: Annotated[
-            bool, typer.Option("--resume", help="continue an interrupted run, if there is one")
-        ] = False,
-        pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
+        case: Case = None,
+        resume: Resume = False,
+        pdf: Pdf = False,
         explore: Annotated[
             bool, typer.Option("--explore", help="also write explorer.html, to look at all runs")
         ] = False,
-        quiet: Annotated[bool, typer.Option("--quiet", help="hide progress")] = False,
+        quiet: Quiet = False,
     ) -> None:
         """Map all subsets of controlled links and modes, workspace modes and platform error."""
         from studies.engine.folder import ATLASES, refuse_existing

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from studies.config import start
 from studies.errors import StudyError
+from studies.options import Precision
 from studies.results.document import AsJson, print_document
 
 
@@ -28,7 +29,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             int, typer.Option(min=0, max=2**20, help="cases per chunk; 0: automatic")
         ] = 0,
         cases: Annotated[int, typer.Option(min=0, help="cases in the sweep; 0: 100,000")] = 0,
-        precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
+        precision: Precision = "float64",
         as_json: AsJson = False,
     ) -> None:
         """Measure speed and memory on this machine."""

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from studies.config import start
+from studies.options import Out, Resume
 
 
 def add_commands(app: typer.Typer, console: Console) -> None:
@@ -20,10 +21,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         measured: Annotated[
             Path, typer.Argument(help="file with measurements, wishes and processor (TOML)")
         ],
-        out: Annotated[Path, typer.Option(help="folder for all stages and the report")],
-        resume: Annotated[
-            bool, typer.Option("--resume", help="continue an interrupted run, if there is one")
-        ] = False,
+        out: Out,
+        resume: Resume = False,
     ) -> None:
         """Lead from measurements to verified firmware: fit, tune, certify, export.
 

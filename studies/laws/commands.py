@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
 
 from studies.config import start
+from studies.options import Case, Design, Out, Quiet, Resume
 from studies.publish import REPORT, announce
 
 
@@ -17,23 +17,16 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
     @app.command()
     def laws(
-        design: Annotated[
-            Path, typer.Argument(help="study file, ready-made design, folder of a tuning or sweep")
-        ],
-        out: Annotated[Path, typer.Option(help="folder for report, data and tuned studies")],
-        case: Annotated[
-            str | None,
-            typer.Option(help="case of a sweep (number or id:...) or family of a tuning"),
-        ] = None,
+        design: Design,
+        out: Out,
+        case: Case = None,
         voltage: Annotated[
             float | None,
             typer.Option(help="largest actuator voltage [V]; default: what the design needs"),
         ] = None,
         margin: Annotated[float, typer.Option(help="least disk margin [1]")] = 0.4,
-        resume: Annotated[
-            bool, typer.Option("--resume", help="continue an interrupted run, if there is one")
-        ] = False,
-        quiet: Annotated[bool, typer.Option("--quiet", help="hide progress")] = False,
+        resume: Resume = False,
+        quiet: Quiet = False,
     ) -> None:
         """Compare control laws and drives, each tuned to one budget, on machines they never saw.
 

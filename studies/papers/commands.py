@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -10,6 +9,7 @@ from rich.console import Console
 
 from studies.config import start
 from studies.errors import StudyError
+from studies.options import MaybeOut, Pdf, Precision
 
 
 def add_commands(app: typer.Typer, console: Console) -> None:
@@ -18,9 +18,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     @app.command()
     def paper(
         name: Annotated[str, typer.Argument(help="of a card; default: list them")] = "",
-        out: Annotated[Path | None, typer.Option(help="folder for data, figures, report")] = None,
-        precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
-        pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
+        out: MaybeOut = None,
+        precision: Precision = "float64",
+        pdf: Pdf = False,
     ) -> None:
         """Test what a paper claims: outcome of each claim, data, figures, open numbers."""
         start(precision)

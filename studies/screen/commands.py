@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from enum import StrEnum
-from pathlib import Path
 from shlex import quote
 from typing import Annotated
 
@@ -19,6 +18,7 @@ from studies.cluster.connect import (
     WorkerTimeout,
 )
 from studies.config import start
+from studies.options import Out, Precision, Quiet, Resume, SweepFile
 from studies.publish import REPORT, announce
 from studies.study.margin import ENOUGH
 
@@ -35,8 +35,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
     @app.command()
     def screen(
-        spec: Annotated[Path, typer.Argument(help="sweep file (TOML) or name of a ready-made one")],
-        out: Annotated[Path, typer.Option(help="folder for the results")],
+        spec: SweepFile,
+        out: Out,
         by: Annotated[
             str, typer.Option(help="metric; default: sweep.by. After - the largest come first")
         ] = "",
@@ -47,13 +47,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         fidelity: Annotated[
             Fidelity, typer.Option(help="model of the runs; full takes about twice as long")
         ] = Fidelity.LINEAR,
-        resume: Annotated[
-            bool, typer.Option("--resume", help="go on with the screen in this folder, if any")
-        ] = False,
-        quiet: Annotated[
-            bool, typer.Option("--quiet", help="print neither progress nor results")
-        ] = False,
-        precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
+        resume: Resume = False,
+        quiet: Quiet = False,
+        precision: Precision = "float64",
         scheduler: Scheduler = None,
         local_workers: LocalWorkers = None,
         worker_timeout: WorkerTimeout = TIMEOUT,

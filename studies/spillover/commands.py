@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
 
 from studies.config import start
-from studies.sweeps.commands import Tolerance
+from studies.options import Case, Design, Out, Pdf, Tolerance
 
 
 def add_commands(app: typer.Typer, console: Console) -> None:
@@ -18,14 +17,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
     @app.command()
     def spillover(
-        design: Annotated[
-            Path, typer.Argument(help="study file, ready-made design, folder of a tuning or sweep")
-        ],
-        out: Annotated[Path, typer.Option(help="folder for report, data and figures")],
-        case: Annotated[
-            str | None,
-            typer.Option(help="case of a sweep (number or id:...) or family of a tuning"),
-        ] = None,
+        design: Design,
+        out: Out,
+        case: Case = None,
         margin: Annotated[
             float, typer.Option(help="gain margin required on every plant [1]; 2 is 6 dB")
         ] = 2.0,
@@ -38,7 +32,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             ),
         ] = False,
         tolerance: Tolerance = None,
-        pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
+        pdf: Pdf = False,
     ) -> None:
         """Certify a controller on plants that differ from its model."""
         from studies.publish import check_folder

@@ -6,7 +6,7 @@ import re
 import sys
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -20,6 +20,7 @@ from studies.cluster.connect import (
 )
 from studies.config import start
 from studies.errors import StudyError
+from studies.options import MaybeOut, Precision, Quiet, Resume, SweepFile, Tolerance
 from studies.publish import EXPLORER, REPORT, announce
 from studies.results.document import AsJson, print_document
 
@@ -28,14 +29,6 @@ if TYPE_CHECKING:
 
 #: Replaced in names of files: the brackets of entries.
 _NO_NAME = r"[^\w.-]+"
-#: Of the commands that look for the smallest change that breaks a design.
-Tolerance: TypeAlias = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="NAME=VALUE, one unit of a kind of change that may break a design: stiffness, "
-        "damping, payload, patch, delay, actuator, sensor, joint_inertia; 0: it does not change"
-    ),
-]
 Folder = Annotated[Path, typer.Argument(help="folder of a sweep")]
 
 
@@ -54,25 +47,18 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
     @app.command()
     def sweep(
-        spec: Annotated[Path, typer.Argument(help="sweep file (TOML) or name of a ready-made one")],
-        out: Annotated[Path | None, typer.Option(help="folder for the results")] = None,
-        resume: Annotated[
-            bool,
-            typer.Option(
-                "--resume", help="continue the sweep in this folder, or extend it, if there is one"
-            ),
-        ] = False,
+        spec: SweepFile,
+        out: MaybeOut = None,
+        resume: Resume = False,
         dry_run: Annotated[
             bool, typer.Option("--dry-run", help="show what would run, and how long it would take")
         ] = False,
-        quiet: Annotated[
-            bool, typer.Option("--quiet", help="print neither progress nor results")
-        ] = False,
+        quiet: Quiet = False,
         report: Annotated[bool, typer.Option("--report", help="also write report.html")] = False,
         explore: Annotated[
             bool, typer.Option("--explore", help="also write explorer.html, to look at all cases")
         ] = False,
-        precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
+        precision: Precision = "float64",
         scheduler: Scheduler = None,
         local_workers: LocalWorkers = None,
         worker_timeout: WorkerTimeout = TIMEOUT,

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
-
 import typer
 from rich.console import Console
 
 from studies.config import start
+from studies.options import Case, Design, MaybeOut
 from studies.results.document import AsJson, print_document
 
 
@@ -17,16 +15,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
     @app.command()
     def twin(
-        design: Annotated[
-            Path, typer.Argument(help="study file, ready-made design, folder of a tuning or sweep")
-        ],
-        out: Annotated[
-            Path | None, typer.Option(help="folder for report, figure and numbers")
-        ] = None,
-        case: Annotated[
-            str | None,
-            typer.Option(help="case of a sweep (number or id:...) or family of a tuning"),
-        ] = None,
+        design: Design,
+        out: MaybeOut = None,
+        case: Case = None,
         as_json: AsJson = False,
     ) -> None:
         """Repeat the loop with a machine in Exudyn and the exported controller, and compare."""
