@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from shlex import quote
 
@@ -20,7 +19,7 @@ from studies.screen.stored import BEST
 from studies.screen.tally import LEFT_OUT, quantile
 from studies.show.listing import Rows
 from studies.show.pages import write_report
-from studies.show.report import Chapter, Drawing, Report, chapter
+from studies.show.report import Chapter, Drawing, Report, chapter, drawing
 from studies.show.units import count_text, headed, readable
 from studies.study.margin import margin_text
 from studies.study.template import toml_text
@@ -251,15 +250,9 @@ def _drawings(done: ScreenOutcome) -> list[Drawing]:
     """The figures, if there are values that a log scale has."""
     if not done.tally.sketch[0, 1:].any():
         return []
-    baseline = "" if done.uncontrolled is None else "; dashed: the baseline without control"
-    by_value = f"""Designs that ended well by value, unstable ones included; line: the last one that
-    was kept{baseline}"""
-    by_axis = """Values of the designs that ended well by interval of every axis, unstable ones
-    included: the median and, of enough designs, the best 10 % and the best 0.1 %. Where few end
-    well, they differ in more than this axis"""
-    drawn = [Drawing("values", by_value, partial(values, done))]
+    drawn = [drawing(values, done)]
     if done.screen.axes.names:
-        drawn.append(Drawing("influence", by_axis, partial(influence, done)))
+        drawn.append(drawing(influence, done))
     return drawn
 
 

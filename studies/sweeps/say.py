@@ -15,7 +15,7 @@ from studies.engine.results import SweepData, as_sweep, counted_links, metric_va
 from studies.errors import shown
 from studies.publish import publish
 from studies.show.pages import write_report
-from studies.show.report import Chapter, Drawing, Items, Report, chapter, machine, sentence
+from studies.show.report import Chapter, Drawing, Items, Report, chapter, drawing, machine, sentence
 from studies.show.units import count_text
 from studies.space.axes import SHOWN_AS
 from studies.space.methods import METHODS
@@ -174,17 +174,14 @@ def _best_cases(data: SweepData, metric: str, best: np.ndarray) -> Chapter | Non
 def _drawings(data: SweepData, metric: str) -> list[Drawing]:
     """Those of the figures that these cases have."""
     screen = data.spec.screen
-    captions = {
-        "cases": f"Cases of status ok and their {metric}",
-        "screen": "The full model over the linear one that screened the cases",
-        "front": f"{metric} over the gain margin; line: the cases that no other case beats in both",
-    }
-    drawn = {
-        "cases": has_axes(data, metric) and partial(plot, data, None, metric),
-        "screen": screen and show.is_ranked(data, screen.entry) and partial(draw_screen, data),
-        "front": _has_front(data, metric) and partial(front, data, metric),
-    }
-    return [Drawing(name, captions[name], draw) for name, draw in drawn.items() if draw]
+    drawn = []
+    if has_axes(data, metric):
+        drawn.append(drawing(plot, data, None, metric, name="cases"))
+    if screen and show.is_ranked(data, screen.entry):
+        drawn.append(drawing(draw_screen, data, name="screen"))
+    if _has_front(data, metric):
+        drawn.append(drawing(front, data, metric))
+    return drawn
 
 
 def _rival_text(data: SweepData, metric: str, first: int) -> str:

@@ -127,7 +127,7 @@ def _rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def draw_screen(data: SweepData) -> Figure:
-    """The full model's values over the linear one's, of a screen with a case of status ok."""
+    """The full model over the linear one that screened the cases."""
     assert data.spec.screen is not None
     by = data.spec.screen.entry
     order, value = _order(data), shown_metric(data, by)
