@@ -251,18 +251,10 @@ def _reasons(machines: Machines) -> Chapter | None:
         {bent[free].max():.3g} µm and {residual[free].max():.3g} µm. The EI shaper alone reduces the
         residual vibration by a factor of {shaped[0]:.3g} on the paper's move and of
         {shaped[1]:.3g} on the faster one.""",
-        """**Units.** The paper gives no unit for its PSD, so only percentages can be compared. It
-        prints gains in N s/m, but its (20) to (23) give 1/s; N s/m is used here.""",
         f"""**Structural damping** is not in the paper. The fit finds
         {", ".join(f"{x:.2g}" for x in damping)} for modes 1 and 2, and {study.link.damping_ratio:g}
         is assumed on the nominal machine; the rows with {HIGH_DAMPING:g} show how much the settling
         depends on it.""",
-        """**Platform and coupling.** The paper blames the residual error on the links alone; here
-        the drive, whose gains are not in the paper, decides the first part of it. Links act on each
-        other through the platform's motion; the matrix that the paper holds responsible has no
-        terms between links.""",
-        """**Not in the paper** and assumed or fitted: Young's modulus of the links, inertia of
-        joints and platform, drive, converters, filters, delay, the motion of section 5.""",
     ]
     if "weak" in cases:
         weak = 0.02 * study.control.velocity_gain[0] * study.control.gain_factor
