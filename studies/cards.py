@@ -102,28 +102,6 @@ def _sweep(outcome: Any) -> Card:
     return Card(data.spec.study.title, lines, listing.heads, listing.rows, figure=figure)
 
 
-def _tuning(found: Any) -> Card:
-    """Of `run_tuning`."""
-    from studies.tuning.plots import descent
-    from studies.tuning.report import file_name, summary
-
-    spec, at = found.spec, found.at
-    values = spec.free.values(at.best_place)
-    winners = [at.winner(k) for k in range(len(spec.moving))]
-    rows = [
-        [name, *(f"{values[k][j]:.4g}" for k in winners)]
-        for j, name in enumerate(spec.free.names[:MOST])
-    ]
-    files = [f"{family.name} ({file_name(spec, family)})" for family in spec.moving]
-    return Card(
-        spec.study.title,
-        summary(spec, found),
-        ["number", *files],
-        rows,
-        figure=descent(spec, found),
-    )
-
-
 def _fit(fitted: Any) -> Card:
     """Of `fit` and `run_fit`."""
     from studies.fitting.plots import drawings
@@ -183,12 +161,11 @@ def _modes(modes: Any) -> Card:
 
 
 #: Module with the function `say`, by the name of the type.
-SAY = {"Certificate": "studies.spillover.say"}
+SAY = {"Certificate": "studies.spillover.say", "TuneFindings": "studies.tuning.say"}
 #: By the name of the type.
 CARDS: dict[str, Callable[[Any], Card]] = {
     "Run": _run,
     "Outcome": _sweep,
-    "TuneFindings": _tuning,
     "Fitted": _fit,
     "LawFindings": _laws,
     "Exported": _export,
