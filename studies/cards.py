@@ -102,17 +102,6 @@ def _sweep(outcome: Any) -> Card:
     return Card(data.spec.study.title, lines, listing.heads, listing.rows, figure=figure)
 
 
-def _fit(fitted: Any) -> Card:
-    """Of `fit` and `run_fit`."""
-    from studies.fitting.plots import drawings
-    from studies.fitting.report import statements, value_rows
-
-    heads = ["parameter", "value", "sigma", "unit", "95 %", ""]
-    drawing = next(iter(drawings(fitted).values()), lambda: None)
-    rows = value_rows(fitted)
-    return Card(fitted.study.title, statements(fitted), heads, rows, figure=drawing())
-
-
 def _laws(findings: Any) -> Card:
     """Of `run_laws`."""
     from studies.laws.findings import verdict
@@ -161,12 +150,15 @@ def _modes(modes: Any) -> Card:
 
 
 #: Module with the function `say`, by the name of the type.
-SAY = {"Certificate": "studies.spillover.say", "TuneFindings": "studies.tuning.say"}
+SAY = {
+    "Certificate": "studies.spillover.say",
+    "Fitted": "studies.fitting.say",
+    "TuneFindings": "studies.tuning.say",
+}
 #: By the name of the type.
 CARDS: dict[str, Callable[[Any], Card]] = {
     "Run": _run,
     "Outcome": _sweep,
-    "Fitted": _fit,
     "LawFindings": _laws,
     "Exported": _export,
     "NamedModes": _modes,

@@ -80,49 +80,26 @@ def front(spec: TuneSpec, findings: TuneFindings, limit: str) -> Figure:
             (kept, figures.SERIES[0], "random, all limits satisfied"),
         ):
             if chosen.any():
-                ax.scatter(
-                    search.peaks[chosen, column],
-                    search.objective[chosen],
-                    s=5,
-                    color=color,
-                    linewidths=0,
-                    label=label,
-                    rasterized=True,
-                )
+                x, y = search.peaks[chosen, column], search.objective[chosen]
+                ax.scatter(x, y, s=5, color=color, linewidths=0, label=label, rasterized=True)
     at = findings.at
     done = np.isfinite(at.best_objective) & (excess(at.best_limits) == 0)
-    ax.plot(
-        at.best_peaks[done, column],
-        at.best_objective[done],
-        "x",
-        color=figures.SERIES[1],
-        markersize=4,
-        label="every starting point, machines of the tuning",
-    )
+    x, y = at.best_peaks[done, column], at.best_objective[done]
+    label = "every starting point, machines of the tuning"
+    ax.plot(x, y, "x", color=figures.SERIES[1], markersize=4, label=label)
     points = [(x.metrics[limit].max(), x.objective.mean()) for x in findings.judged]
     line = np.array([p for p, family in zip(points, spec.families, strict=True) if family.front])
     if len(line):
         line = line[np.argsort(line[:, 0])]
-        ax.plot(
-            *line.T,
-            "o-",
-            markersize=4,
-            color=figures.SERIES[2],
-            label="Pareto front, on fresh machines",
-        )
+        label = "Pareto front, on fresh machines"
+        ax.plot(*line.T, "o-", markersize=4, color=figures.SERIES[2], label=label)
     marks = iter("^vD*P<>")
     baseline = findings.baseline.metrics[limit].max(), findings.baseline.objective.mean()
     ax.plot(*baseline, "s", color="black", label="baseline")
     for point, family in zip(points, spec.families, strict=True):
         if not family.front:
-            ax.plot(
-                *point,
-                next(marks, "h"),
-                color="black",
-                markerfacecolor="white",
-                zorder=3,
-                label=f"{family.name}, fresh machines",
-            )
+            mark, label = next(marks, "h"), f"{family.name}, fresh machines"
+            ax.plot(*point, mark, color="black", markerfacecolor="white", zorder=3, label=label)
     limits = {family.limits.get(limit) for family in spec.moving if not family.front}
     for value in sorted(x for x in limits if isinstance(x, float)):
         ax.axvline(value, color="black", linewidth=0.8, linestyle=":", label="limit")

@@ -189,12 +189,13 @@ def _question(findings: TuneFindings) -> str:
     names_links = all(parse_entries(name).names_a_link for name in spec.metric_terms)
     links = "" if names_links else f" of {links_text(spec.counted_links, spec.study.n_links)}"
     limits = ", ".join(_bound(name, value) for name, value in tune.limits.items())
-    frozen = int(at.is_frozen.sum())
+    lost = int(at.is_frozen.sum())
+    frozen = f" {count_text(lost, 'starting point')} frozen." if lost else ""
     return f"""which design has the {", ".join(goals)}{links}{limits and f" with {limits}"}?
     {count_text(len(spec.free.numbers), "free parameter")} in
     {count_text(len(spec.moving), "family")}, {count_text(len(at.family), "starting point")},
     {count_text(tune.scenarios.count, "machine")} on {count_text(len(spec.moves), "move")}.
-    {ended(spec, at)} {f"{count_text(frozen, 'starting point')} frozen." if frozen else ""}"""
+    {ended(spec, at)}{frozen}"""
 
 
 def _bound(name: str, value: float | str) -> str:

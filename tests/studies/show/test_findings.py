@@ -550,6 +550,7 @@ def test_a_tuning_s_summary_and_recommendation():
             ("gains", "all"), found.judged, ("", "; stopped by peak_voltage"), strict=True
         )
     ]
+    assert found._repr_html_().count("data:image/png;base64,") == 1
     alone = spec.tune.scenarios.model_copy(update={"spread": {}, "machines": {}})
     spec = spec._replace(tune=spec.tune.model_copy(update={"scenarios": alone}))
     _, first, *_, last = say_tuning(found._replace(spec=spec)).result

@@ -341,7 +341,7 @@ def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
     cli.main(["tune", str(file), "--out", str(out)])
     text = text_of((out / "report.html").read_text(encoding="utf-8"))
     for part in (
-        "which design has the least residual_rms of all links with peak_voltage at most",
+        "Which design has the least residual_rms of all links with peak_voltage at most",
         "| gains |",
         "| loud |",
         "| all, peak_voltage 20 |",
