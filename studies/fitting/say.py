@@ -58,9 +58,10 @@ def _question(fitted: Fitted) -> str:
     held_out = f" (and {len(fitted.checks)} held out)" if fitted.checks else ""
     known = count_text(len(spec.priors), "parameter")
     beforehand = f" and what is known of {known} beforehand" if spec.priors else ""
-    return f"""{count_text(len(fitted.names), "parameter")} from {count_text(kept, "measurement")}
-    {held_out}{beforehand}; multi-start from {count_text(fitted.solution.rated, "starting point")},
-    the best {spec.fit.refine} followed to the end."""
+    data = f"{count_text(kept, 'measurement')}{held_out}{beforehand}"
+    return f"""{count_text(len(fitted.names), "parameter")} from {data}; multi-start from
+    {count_text(fitted.solution.rated, "starting point")}, the best {spec.fit.refine} followed to
+    the end."""
 
 
 def value_rows(fitted: Fitted) -> Rows:
