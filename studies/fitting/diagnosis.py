@@ -21,7 +21,7 @@ from studies.fitting.kinds.contract import Measurement
 from studies.fitting.measurements import make_bench, make_measurements
 from studies.fitting.problem import Problem, make_problem
 from studies.fitting.solve import descend_all, follow
-from studies.fitting.spec import FitSpec, number_unit, parse_fit
+from studies.fitting.spec import FitSpec, number_unit, parse_fit, shown_value
 from studies.fitting.statistics import misfit
 from studies.space.free import plain_numbers
 from studies.study.paths import free_fields, known_field, parts_of
@@ -158,9 +158,7 @@ def _of_fields(spec: FitSpec, problem: Problem, u: np.ndarray) -> list[Remedy]:
         place[moving] = done.x
         value = float(whole.free.values(place)[number])
         own = whole.free.numbers[number].start
-        unit = number_unit(name)
-        size = f"{value:.4g} {unit}".removesuffix(" 1")
-        text = f"{name}, which is fixed at {own:.4g}, is {size}"
+        text = f"{name}, which is fixed at {shown_value(name, own)}, is {shown_value(name, value)}"
         found.append(Remedy(text, before, 2 * float(done.cost)))
     return found
 

@@ -7,7 +7,7 @@ import numpy as np
 from studies.fitting.estimate import Fitted, is_good, named_values
 from studies.fitting.experiment import Experiment
 from studies.fitting.kinds.contract import Line
-from studies.fitting.report import sentences, unknown_numbers
+from studies.fitting.say import sentences, unknown_numbers
 from studies.fitting.statistics import Misfit
 from studies.results.labelled import Labelled, Records, Variable, labelled, told, variables
 

@@ -11,35 +11,47 @@ from matplotlib.figure import Figure
 
 from studies.fitting.decays import Diagram
 from studies.fitting.kinds.contract import Line, Numbers
-from studies.fitting.spec import number_unit
+from studies.fitting.spec import named_unit, shown_unit
 from studies.fitting.statistics import WIDE
 from studies.show.figures import SMALL, WIDTH, legend_above, new_figure
+from studies.show.report import Drawing
+from studies.show.units import count_text
 
 if TYPE_CHECKING:
     from studies.fitting.estimate import Fitted
 
 #: All figures there can be.
-NAMES = ("stabilisation", "fit", "numbers", "correlations", "profiles", "samples")
+NAMES = ("machine", "stabilisation", "fit", "numbers", "correlations", "profiles", "samples")
 #: Measurements in one figure, single numbers, and numbers whose samples are drawn.
 MOST, MOST_NUMBERS, MOST_SAMPLED = 8, 40, 6
+#: Captions.
+CURVES = (
+    "Data and model; below each, model minus measurement in standard deviations of the noise; of "
+    "complex responses real and imaginary part; band: two of them to each side"
+)
+PROFILES = (
+    "Least misfit for fixed values of one parameter, the others fitted anew; dashed: what sigma "
+    "says; the interval of 95 % lies between the crossings of the grey line"
+)
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#999999"
 
 
-def drawings(fitted: Fitted) -> dict[str, Callable[[], Figure]]:
-    """What draws each figure, by its name."""
+def drawings(fitted: Fitted) -> dict[str, Drawing]:
+    """Figures of data, model and parameters, by their names."""
     lines = [(_plain(x.title), x.part) for x in fitted.comparisons if isinstance(x.part, Line)]
     single = [(_plain(x.title), x.part) for x in fitted.comparisons if isinstance(x.part, Numbers)]
-    diagrams = [(name, x.diagram) for name, x in single if x.diagram is not None]
-    has_several, posterior = len(fitted.names) > 1, fitted.posterior
-    every = {
-        "stabilisation": diagrams and partial(stabilisation, diagrams[:MOST]),
-        "fit": lines and partial(curves, lines[:MOST]),
-        "numbers": single and partial(numbers, single),
-        "correlations": has_several and partial(correlations, fitted),
-        "profiles": fitted.profiles and partial(profiles, fitted),
-        "samples": has_several and posterior and partial(samples, posterior.values, fitted.names),
-    }
-    return {name: drawing for name, drawing in every.items() if callable(drawing)}
+    diagrams = [(name, x.diagram) for name, x in single if x.diagram is not None][:MOST]
+    has_several, further = len(fitted.names) > 1, max(len(lines) - MOST, 0)
+    left = f"; {count_text(further, 'further measurement')}: in fit.h5" if further else ""
+    every: list[tuple[object, str, str, Callable[[], Figure]]] = [
+        (lines, "fit", f"{CURVES}{left}", partial(curves, lines[:MOST])),
+        (single, "numbers", "Single values: model minus measured", partial(numbers, single)),
+        (diagrams, "stabilisation", "Stabilisation diagram", partial(stabilisation, diagrams)),
+        (has_several, "correlations", "Correlations", partial(correlations, fitted)),
+        (fitted.profiles, "profiles", PROFILES, partial(profiles, fitted)),
+        (has_several and fitted.posterior, "samples", "Samples", partial(samples, fitted)),
+    ]
+    return {name: Drawing(name, text, draw) for is_there, name, text, draw in every if is_there}
 
 
 def _plain(text: str) -> str:
@@ -140,15 +152,19 @@ def profiles(fitted: Fitted) -> Figure:
     figure, axes = new_figure((count + 1) // 2, min(count, 2), 1.9, has_shared_abscissa=False)
     for ax, one in zip(axes.ravel(), fitted.profiles, strict=False):
         k = one.number
+        factor, unit = shown_unit(fitted.names[k])
         value, sigma = fitted.answer.values[k], fitted.answer.sigma[k]
-        ax.plot(*one.smooth(), color=BLUE, label="profile")
-        ax.plot(one.values, one.rise, "o", ms=3, color=BLUE)
+        x, rise = one.smooth()
+        ax.plot(factor * x, rise, color=BLUE, label="profile")
+        ax.plot(factor * one.values, one.rise, "o", ms=3, color=BLUE)
         if sigma > 0:
             x = np.linspace(one.values.min(), one.values.max(), 101)
-            ax.plot(x, ((x - value) / sigma) ** 2, "--", color=ORANGE, lw=1, label="from sigma")
+            ax.plot(
+                factor * x, ((x - value) / sigma) ** 2, "--", color=ORANGE, lw=1, label="from sigma"
+            )
         ax.axhline(WIDE**2, color=GREY, lw=0.8, label="95 %")
         ax.set_ylim(0, 1.6 * WIDE**2)
-        ax.set(xlabel=f"[{number_unit(fitted.names[k])}]", ylabel="rise of chi square")
+        ax.set(xlabel=f"[{unit or '1'}]", ylabel="rise of chi square")
         ax.locator_params(axis="x", nbins=5)
         ax.set_title(fitted.names[k], loc="left", fontsize=9)
     legend_above(figure, axes[0, 0])
@@ -157,13 +173,11 @@ def profiles(fitted: Fitted) -> Figure:
     return figure
 
 
-def samples(values: np.ndarray, names: Sequence[str]) -> Figure:
-    """Histograms of sampled numbers, and pairs of them.
-
-    Args:
-        values: (n, p).
-        names: of the numbers.
-    """
+def samples(fitted: Fitted) -> Figure:
+    """Histograms of sampled parameters, and pairs of them."""
+    assert fitted.posterior is not None
+    values = fitted.posterior.values * [shown_unit(name)[0] for name in fitted.names]
+    names = [named_unit(name) for name in fitted.names]
     n = min(len(names), MOST_SAMPLED)
     figure, axes = new_figure(n, n, 7.0 / n, has_shared_abscissa=True)
     for row in range(n):

@@ -13,18 +13,24 @@ from studies.engine.run_data import run_attributes
 from studies.fitting import plots
 from studies.fitting.document import fit_document, fit_variables
 from studies.fitting.estimate import Fitted, estimate, fit_phases, suggest
-from studies.fitting.report import report, summary
+from studies.fitting.say import say, value_rows
 from studies.fitting.spec import FitSpec
 from studies.fitting.statistics import REGION
 from studies.publish import REPORT, announce, check_folder, publish
 from studies.results.document import json_text
-from studies.show.figures import draw
+from studies.show.listing import print_rows
+from studies.show.pages import page, write_report
+from studies.show.report import print_result
 from studies.store import write_store
 from studies.study.template import study_template
 from studies.threads import serial_blas
 
 #: Least gain margin of that tuning [1].
 MARGIN = 2.0
+#: Comment in that file.
+UNEXPLAINED = (
+    "# THE MODEL DOES NOT EXPLAIN THE DATA: these machines are too much alike (see report).\n"
+)
 #: Files of the folder.
 STUDY, TUNE, DATA, DOCUMENT = "fitted.toml", "fitted_tune.toml", FIT, "fit.json"
 
@@ -54,13 +60,13 @@ def run_fit(
             (staging / STUDY).write_text(study_template(fitted.study), encoding="utf-8")
             (staging / TUNE).write_text(_tuning(fitted), encoding="utf-8")
             write_store(staging / DATA, fit_variables(fitted), run_attributes(fitted.study))
-            draw(staging, plots.drawings(fitted), has_pdf)
-            (staging / REPORT).write_text(report(fitted, staging), encoding="utf-8")
+            write_report(say(fitted), staging, has_pdf)
         fitted = suggest(fitted, phases)
         with publish(out) as staging:  # only now is there a document: the answer is complete
-            (staging / REPORT).write_text(report(fitted, out), encoding="utf-8")
+            (staging / REPORT).write_text(page(report := say(fitted), out), encoding="utf-8")
             (staging / DOCUMENT).write_text(json_text(fit_document(fitted)), encoding="utf-8")
-    console.print(summary(fitted), soft_wrap=True)
+    print_result(report, console)
+    print_rows(value_rows(fitted), console)
     more = f"; {STUDY} is the fitted study, {TUNE} a tuning for machines like it"
     announce(console, out / REPORT, more)
     return fitted
@@ -95,16 +101,8 @@ def _tuning(fitted: Fitted) -> str:
         f"# {100 * REGION:g} %, about all equally good optima. The controller\n"
         "# knows link.youngs_modulus of each machine; fit link.stiffness_factor for what it does\n"
         "# not know.\n"
-        f"{_warning(fitted)}"
+        f"{'' if fitted.answer.is_explained else UNEXPLAINED}"
         "[tune.scenarios]\ncount = 4   # of them to tune on, with the nominal one\n"
         "check = 16  # others to judge the result\n"
         f"[tune.scenarios.machines]\n{rows}\n"
-    )
-
-
-def _warning(fitted: Fitted) -> str:
-    if fitted.answer.is_explained:
-        return ""
-    return (
-        "# THE MODEL DOES NOT EXPLAIN THE DATA: these machines are too much alike (see report).\n"
     )

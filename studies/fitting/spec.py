@@ -13,6 +13,7 @@ from pydantic import Field, ValidationError
 
 from studies.engine.preflight import check_machine, check_run
 from studies.errors import StudyError, field_error, nearest, shown_name
+from studies.show.units import headed, readable
 from studies.space.axes import Range
 from studies.space.free import (
     FreeNumbers,
@@ -433,6 +434,23 @@ def number_unit(name: str) -> str:
     entry = parse_entry(name)
     assert entry is not None
     return field_unit(entry.field)
+
+
+def shown_unit(name: str) -> tuple[float, str]:
+    """Factor and unit in which a parameter is shown: GPa for Pa; "" for none."""
+    unit = number_unit(name)
+    return readable(unit) if unit == "Pa" else (1.0, "" if unit == "1" else unit)
+
+
+def named_unit(name: str) -> str:
+    """A parameter and its unit as heads and axes have them."""
+    return headed(name, shown_unit(name)[1])
+
+
+def shown_value(name: str, value: float, digits: str = ".4g") -> str:
+    """A value of a parameter as it is shown, with its unit."""
+    factor, unit = shown_unit(name)
+    return f"{factor * value:{digits}} {unit}".rstrip()
 
 
 def _prior(written: dict[str, Any], k: int, path: str, span: Range) -> Prior:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from studies.cluster.connect import (
     TIMEOUT,
@@ -83,22 +82,16 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
 
 def _audit(spec: TuneSpec, console: Console) -> None:
+    from studies.show.listing import Rows, print_rows
     from studies.tuning.audit import ALLOWED, DESIGNS, MEANING, audit
 
     console.print(f"comparing derivatives with finite differences at {DESIGNS} designs")
-    names = "parameter", "family", "worst for", "at", "derivative", "difference", "disagreement"
-    table, checks = Table(*names), audit(spec)
-    for check in checks:
-        table.add_row(
-            check.name,
-            check.family,
-            check.figure,
-            f"{check.place + 1}",
-            f"{check.derivative:.6g}",
-            f"{check.difference:.6g}",
-            f"{check.share:.1e}",
-        )
-    console.print(table)
+    heads = ["parameter", "family", "worst for", "at", "derivative", "difference", "disagreement"]
+    rows, checks = [], audit(spec)
+    for x in checks:
+        numbers = f"{x.derivative:.6g}", f"{x.difference:.6g}", f"{x.share:.1e}"
+        rows.append([x.name, x.family, x.figure, f"{x.place + 1}", *numbers])
+    print_rows(Rows(heads, rows), console)
     console.print(f"Design 1 is close to the baseline. {MEANING}", soft_wrap=True)
     worst = max(check.share for check in checks)
     is_fine = worst <= ALLOWED

@@ -9,7 +9,7 @@ import numpy as np
 from studies.publish import shown
 from studies.tuning.audit import Disagreement
 from studies.tuning.check import JudgedDesign, RandomSearch
-from studies.tuning.optimise import KEPT, Progress
+from studies.tuning.optimise import KEPT, Progress, excess
 from studies.tuning.references import References
 from studies.tuning.spec import LOOP_LIMITS, Family, TuneSpec
 
@@ -43,6 +43,12 @@ def best_family(spec: TuneSpec, findings: TuneFindings) -> int:
         return beyond > 0, not np.isfinite(value), value
 
     return min(range(len(spec.moving)), key=rank)
+
+
+def is_kept(spec: TuneSpec, search: RandomSearch) -> np.ndarray:
+    """Which random designs finish and keep all limits, (n,)."""
+    loop = search.beyond_loop if spec.loop_limits else np.full(len(search.objective), -np.inf)
+    return np.isfinite(search.objective) & (excess(search.limits) == 0) & (loop <= KEPT)
 
 
 def violated_limits(spec: TuneSpec, at: Progress) -> list[str]:

@@ -222,8 +222,8 @@ def reference_lines(spec: TuneSpec, baseline: JudgedDesign, references: Referenc
         if name == ALONE and references.scan is not None:
             value = references.scan.gain_factor[references.scan.best]
             which = (
-                f"{name}, {value:.4g} instead of {spec.study.control.gain_factor:.4g} (the best "
-                f"of {len(references.scan.gain_factor)} values on the scenarios of the tuning)"
+                f"the best {name}, {value:.4g} instead of {spec.study.control.gain_factor:.4g} (of "
+                f"{len(references.scan.gain_factor)} values on the scenarios of the tuning)"
             )
         terms = [_term(x, design, baseline) for x in spec.metric_terms]
         if design.loop is not None and baseline.loop is not None:
@@ -235,7 +235,7 @@ def reference_lines(spec: TuneSpec, baseline: JudgedDesign, references: Referenc
     if references.scan is not None and references.scan.best < 0:
         values = references.scan.gain_factor
         lines.append(
-            f"{ALONE}: none of {len(values)} values from {values[0]:.3g} to {values[-1]:.3g} "
+            f"none of {len(values)} values of {ALONE}, from {values[0]:.3g} to {values[-1]:.3g}, "
             "keeps the limits"
         )
     return lines

@@ -21,30 +21,24 @@ from studies.engine.folder import make_manifest
 from studies.engine.progress import Phases, duration_text
 from studies.engine.run_data import run_attributes
 from studies.errors import StudyError
-from studies.publish import REPORT, publish
-from studies.show.figures import draw
-from studies.show.sketch import sketch
+from studies.publish import publish
+from studies.show.pages import write_report
+from studies.show.report import Report, print_result
 from studies.show.units import count_text
 from studies.store import write_store
 from studies.study.files import signed
 from studies.study.spec import Study
 from studies.study.template import study_template
-from studies.tuning import plots
 from studies.tuning.audit import Disagreement, audit
 from studies.tuning.check import RandomSearch, search, tuned_study
 from studies.tuning.evaluate import Evaluator
-from studies.tuning.findings import TuneFindings, best_family, violated_limits
+from studies.tuning.findings import TuneFindings, violated_limits
 from studies.tuning.folder import PROGRESS, RESULTS, open_tuning, save_progress, write_designs
 from studies.tuning.optimise import Progress, is_compatible, optimise, start_families
 from studies.tuning.phases import KeptPhases
 from studies.tuning.references import compare
-from studies.tuning.report import (
-    ended,
-    file_name,
-    report,
-    summary,
-)
 from studies.tuning.results import variables
+from studies.tuning.say import ended, file_name, say
 from studies.tuning.spec import TuneSpec
 from studies.tuning.workers import ClusterEvaluator
 
@@ -152,9 +146,10 @@ def _tune(
     phases.say(ended(spec, at))
     findings = find(spec, evaluator, at, phases, KeptPhases(out, at))
     phases.begin("draw")
-    _write(spec, findings, out)
-    for line in summary(spec, findings):
-        phases.say(line)
+    report = say(findings, str(out))
+    _write(findings, report, out)
+    if not phases.is_quiet:
+        print_result(report, phases.console)
     return findings
 
 
@@ -277,21 +272,11 @@ def tuned_studies(spec: TuneSpec, at: Progress, is_over: bool = True) -> dict[st
     return studies
 
 
-def _write(spec: TuneSpec, findings: TuneFindings, out: Path) -> None:
-    studies = tuned_studies(spec, findings.at)
+def _write(findings: TuneFindings, report: Report, out: Path) -> None:
+    spec = findings.spec
     attributes = run_attributes(spec.study) | {"tuning": json.dumps(spec.data)}
-    best = spec.moving[best_family(spec, findings)]
     with publish(out) as staging:
-        for name, study in studies.items():
+        for name, study in tuned_studies(spec, findings.at).items():
             (staging / name).write_text(signed(study_template(study)), encoding="utf-8")
         write_store(staging / RESULTS, variables(spec, findings), attributes)
-        drawings = {
-            "machine": partial(sketch, studies[file_name(spec, best)]),
-            "descent": partial(plots.descent, spec, findings),
-            "gains": partial(plots.gains, spec, findings),
-        }
-        for limit in spec.metric_limits[:1]:
-            along = spec.tune.pareto.get("limit", limit)
-            drawings["front"] = partial(plots.front, spec, findings, along)
-        draw(staging, drawings)
-        (staging / REPORT).write_text(report(spec, findings, str(out), staging), encoding="utf-8")
+        write_report(report, staging)

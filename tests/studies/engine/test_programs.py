@@ -210,7 +210,7 @@ def test_a_word_in_a_report_leaves_all_programs_kept(tmp_path):
         *modules
     }
     assert programs.environment("studies.engine.runs")[0] == before["studies.engine.runs"]
-    reports = "studies/sweeps/say.py", "studies/show/words.py", "studies/tuning/report.html"
+    reports = "studies/sweeps/say.py", "studies/show/words.py", "studies/show/page.html"
     for name in reports:
         assert not changed(name), name
     assert changed("jaxmodel/beam.py") == {*modules}

@@ -13,7 +13,7 @@ from studies.fitting import diagnosis
 from studies.fitting.diagnosis import BETTER, _of_data, _of_links, diagnose
 from studies.fitting.estimate import fit
 from studies.fitting.faults import fault_of
-from studies.fitting.report import sentences
+from studies.fitting.say import sentences
 from studies.fitting.solve import descend
 from studies.fitting.statistics import describe_fit
 from tests.fits import (
@@ -297,8 +297,8 @@ def test_the_fixed_field_that_is_wrong_is_named(folder, measured):
         found = fit(spec_of(folder, *entries(), free=FREE_OF_UNEQUAL, study=study, **options))
     assert not found.answer.is_explained
     (text,) = (x.text for x in found.remedies if x.text.startswith("machine.platform_mass"))
-    value = float(re.fullmatch(".*, which is fixed at 0.14, is (.*) kg", text)[1])
+    value = float(re.fullmatch(".*, which is fixed at 0.14 kg, is (.*) kg", text)[1])
     assert value == pytest.approx(0.25, rel=0.02)
     best = found.remedies[0]  # a payload would do as well
-    assert best.text.startswith(("machine.platform_mass", "load.mass, which is fixed at 0,"))
+    assert best.text.startswith(("machine.platform_mass", "load.mass, which is fixed at 0 kg,"))
     assert any(text in line for line in sentences(found))

@@ -28,8 +28,8 @@ from studies.fitting.plots import curves, drawings, samples
 from studies.fitting.posterior import log_density, sample, shape
 from studies.fitting.problem import check_sanity, make_problem
 from studies.fitting.profiles import profile
-from studies.fitting.report import sentences, undetermined
 from studies.fitting.run import machines, run_fit
+from studies.fitting.say import sentences, undetermined
 from studies.fitting.solve import descend, solve
 from studies.fitting.statistics import describe_fit
 from studies.fitting.tables import column, read_columns
@@ -360,12 +360,12 @@ def test_an_optimum_at_a_bound(folder):
     found = estimate(spec._replace(fit=spec.fit.model_copy(update={"samples": 20, "starts": 4})))
     assert found.answer.values[0] == pytest.approx(72e9, rel=1e-6)
     assert np.all(np.diff(found.profiles[0].values) > 0)
-    assert "link.youngs_modulus ended at its upper bound, 7.2e+10 Pa" in " ".join(sentences(found))
+    assert "link.youngs_modulus ended at its upper bound, 72 GPa" in " ".join(sentences(found))
     places = found.posterior.places
     assert places.shape == (20, 1) and np.all((places > 0) & (places < 1))
     assert found.posterior.effective.shape == (1,)
     drawn = drawings(found)
-    drawn["profiles"]().canvas.draw()
+    drawn["profiles"].draw().canvas.draw()
     assert "samples" not in drawn  # against which other number?
 
 
@@ -659,9 +659,15 @@ def test_curves_have_their_residuals_below():
 
 
 def test_samples_are_drawn_in_pairs():
-    shown = samples(np.random.default_rng(0).normal(size=(50, 3)), ("a", "b", "c")).axes
+    """In the units of the report."""
+    values = np.random.default_rng(0).normal(size=(50, 3))
+    names = "link.youngs_modulus", "drive.kp", "link.damping_ratio"
+    fitted = SimpleNamespace(names=names, posterior=SimpleNamespace(values=values))
+    shown = samples(fitted).axes
     assert [ax.get_visible() for ax in shown] == [k // 3 >= k % 3 for k in range(9)]
-    assert shown[6].get_xlabel() == "a" and shown[6].get_ylabel() == "c"
+    assert shown[6].get_xlabel() == "link.youngs_modulus [GPa]"
+    assert shown[6].get_ylabel() == "link.damping_ratio"
+    np.testing.assert_allclose(shown[6].lines[0].get_xdata(), 1e-9 * values[:, 0])
 
 
 def test_samples_of_two_numbers_are_drawn():
@@ -746,6 +752,16 @@ def test_a_fit_is_written_with_what_it_cannot_predict(folder, tmp_path):
     assert {name: list(x) for name, x in written.items()} == machines(found)
     text = text_of((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
     assert "from 1 measurement (and 2 held out)" in text and "## Next experiment" in text
+    head, _, rest = text.partition("## Values")
+    assert head.index("![machine]") < head.index("![fit]") < head.index("![numbers]")
+    low, high = 1e-9 * answer.interval[0]
+    value, sigma, unit, interval = re.search(
+        r"\| link.youngs_modulus \| (\S+) \| (\S+) \| (\S+) \| (.*?) \|", rest
+    ).groups()
+    assert float(value) == pytest.approx(1e-9 * answer.values[0], rel=1e-2) and unit == "GPa"
+    assert float(sigma) == pytest.approx(1e-9 * answer.sigma[0], rel=0.1)
+    assert [float(x) for x in interval.split(" to ")] == pytest.approx([low, high], rel=1e-2)
+    assert found._repr_html_().count("data:image/png;base64,") == 1
     assert "| second link (held out) | mode 2 [Hz] | 457.5 |" in text
     assert "mode 2 of the model" in text
     assert found.experiments[0].widest < 0.5 * np.sqrt(np.linalg.eigvalsh(answer.covariance)[-1])

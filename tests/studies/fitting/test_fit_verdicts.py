@@ -18,8 +18,8 @@ from studies.fitting.bench import Modes
 from studies.fitting.estimate import estimate, is_good
 from studies.fitting.experiment import next_experiments
 from studies.fitting.kinds.modes import Measured, pair_modes
-from studies.fitting.report import describe_direction, sentences, summary
 from studies.fitting.run import run_fit
+from studies.fitting.say import describe_direction, say, sentences
 from studies.fitting.solve import SAME, Solution, exchanges
 from studies.fitting.spec import load_fit
 from studies.fitting.statistics import UNKNOWN, describe_fit
@@ -141,7 +141,8 @@ def test_equally_good_optima_come_first(exchanged):
     """In the first line, the messages, the verdict and the report; six assignments of one set."""
     out, found = exchanged
     assert len(found.rivals) == 5 and not is_good(found)
-    first, *_ = summary(found).splitlines()
+    first, *_ = sentences(found)
+    assert say(found).result[0] == f"**{first}**"
     assert first.startswith("Not identifiable: 5 other optima lie in the data's region of 99 %")
     document = json.loads((out / "fit.json").read_text())
     jsonschema.validate(document, schema("fit"))
@@ -321,7 +322,7 @@ def test_derivatives_at_a_degeneracy_are_confirmed_by_profiles():
     low, high = answer.interval.T
     assert np.all((low < 70e9) & (high > 70e9)) and np.all(high - low < 0.1e9)
     np.testing.assert_allclose(answer.sigma, (high - low) / (2 * 1.96), rtol=0.5)
-    assert not answer.undetermined and "not identifiable" not in summary(found).lower()
+    assert not answer.undetermined and "not identifiable" not in str(say(found).result)
     assert np.all(np.abs(found.machines - 70e9) < 0.1e9)
 
 
@@ -374,7 +375,8 @@ def test_correlated_pairs_are_named_beside_those_that_are_not_identifiable(along
     correlation = np.array([[1.0, -1.0, 0.97], [-1.0, 1.0, 0.2], [0.97, 0.2, 1.0]])
     found = along_a_curve._replace(answer=answer._replace(correlation=correlation))
     said = [x for x in sentences(found) if "strongly correlated" in x]
-    assert len(said) == 1 and said[0].startswith("link.youngs_modulus and link.damping_ratio")
+    assert len(said) == 1 and said[0].startswith("Parameters link.youngs_modulus and")
+    assert " link.damping_ratio are strongly correlated" in said[0]
 
 
 def test_a_parameter_whose_profile_is_open_is_not_identifiable(along_a_curve):

@@ -20,8 +20,7 @@ from studies.tuning.check import JudgedDesign, OwnRun, patch_centers
 from studies.tuning.findings import TuneFindings
 from studies.tuning.loop_figures import DesignFigures
 from studies.tuning.optimise import begin
-from studies.tuning.report import report as tuning_report
-from studies.tuning.report import summary
+from studies.tuning.say import say as say_tuning
 from studies.tuning.spec import parse_tuning
 from tests.bare import paper_study
 from tests.pages import tables_of, text_of
@@ -406,7 +405,7 @@ def tuned():
         run_time=0.1,
         runs=20,
     )
-    html = tuning_report(spec, found)
+    html = page(say_tuning(found))
     return spec, found, tables_of(html), text_of(html)
 
 
@@ -421,7 +420,7 @@ def test_a_tuning_s_table_of_the_own_machine():
     (table,) = tables["On the nominal machine"]
     designs = [found.baseline, *found.judged]
     assert table["design"] == ["baseline", "gains", "all"]
-    assert table["file"] == ["`study.toml`", "`tuned_gains.toml`", "`tuned_all.toml`"]
+    assert table["file"] == ["study.toml", "tuned_gains.toml", "tuned_all.toml"]
     assert table["objective"] == [f"{x.own_run.objective:.4f}" for x in designs]
     for name in NAMES:
         assert_cells(table[HEADS[name]], [FACTOR[name] * x.own_run.metrics[name] for x in designs])
@@ -466,12 +465,13 @@ def test_a_tuning_s_table_of_changes_has_each_move_s_own():
 def test_a_tuning_s_limits_and_numbers():
     _, _, tables, text = tuned()
     words = " ".join(text.split())
+    (table,) = tables["Limits on the scenarios of the tuning"]
+    assert table["design"] == ["gains", "gains", "all", "all"]
+    assert table["limit"] == ["peak_voltage at most 30", "gain_margin at least 1.5"] * 2
     # 2.625/1.5 = 1.75 and 2.375/1.5 = 1.583
+    assert table["left"] == ["20.00 %", "75.00 %", "1.00 %", "58.33 %"]
+    assert table["state"] == ["inactive", "inactive", "active", "inactive"]
     for part in (
-        "- gains: peak_voltage at most 30 (inactive, 20.00 % left); gain_margin at least 1.5 "
-        "(inactive, 75.00 % left)",
-        "- all: peak_voltage at most 30 (active, 1.00 % left); gain_margin at least 1.5 "
-        "(inactive, 58.33 % left)",
         "Those of the loop: on the nominal machine, the only one of the tuning.",
         "worst disagreement is 1.5e-06 (of peak_voltage by control.gain_factor), below 0.0001.",
         "Ended after all 20 iterations",
@@ -501,13 +501,14 @@ def test_placements_are_shown_in_millimetres_along_each_link():
     )
     audited = [Disagreement("placement[2][0]", "tuned", 0, "objective", 1.0, 1.0, 0.0)]
     found = found._replace(
+        spec=spec,
         at=at,
         judged=found.judged[:1],
         audited=audited,
         linear=np.full(1, np.nan),
         residual=np.full(1, np.nan),
     )
-    html = tuning_report(spec, found)
+    html = page(say_tuning(found))
     text = text_of(html)
     (table,) = tables_of(html)["Parameters"]
     centers = 1e3 * patch_centers(spec, spec.moving[0], place[0])
@@ -522,36 +523,35 @@ def test_a_tuning_s_summary_and_recommendation():
     spec, found, _, text = tuned()
     head = " ".join(text.split("## ")[0].split())
     one, own = found.judged[1], found.baseline
-    shares = one.objective
 
     def change(name):
         return f"{100 * (one.own_run.metrics[name] / own.own_run.metrics[name] - 1):+.3g} %"
 
     for part in (
-        f"**Result:** all: residual_rms {change('residual_rms')} "
+        f"**Result:** The best design is all: residual_rms {change('residual_rms')} "
         f"({1e6 * one.own_run.metrics['residual_rms']:.4g} instead of "
         f"{1e6 * own.own_run.metrics['residual_rms']:.4g} µm), ",
         f"settling_time {change('settling_time')} (",
         f"peak_voltage {change('peak_voltage')} ({one.own_run.metrics['peak_voltage']:.4g} "
         f"instead of {own.own_run.metrics['peak_voltage']:.4g} V)",
-        "gain margin 2.38 (7.5 dB) instead of 3.12 (9.9 dB) on the nominal machine",
-        "slowest decay +28.8 % (91.8 instead of 71.2 1/s)",
-        f"the objective on 3 fresh machines is {100 * shares.mean():.3g} % of the baseline's on "
-        f"average, {100 * shares.max():.3g} % at worst.",
+        "gain_margin 2.38 (7.5 dB) instead of 3.12 (9.9 dB) on the nominal machine",
+        "slowest_decay +28.8 % (91.8 instead of 71.2 1/s)",
+        "spillover -85.7 % (0.125 instead of 0.875)",
         "`studies simulate tuned_all.toml",
     ):
         assert part in head, part
     better, worse = head.partition("**Question:**")[0].split(" but ")  # what is worse comes last
-    assert "residual_rms" in better and "slowest decay" in better and "gain margin" in worse
-    assert summary(spec, found) == [
-        f"{name}: {x.objective.mean():.4f} of the baseline's objective on 3 fresh machines, worst "
-        f"{x.objective.max():.4f}; on the worst of them gain_margin {x.loop.gain_margin - 0.5:.4g}"
-        f"{stop}"
+    assert "residual_rms" in better and "slowest_decay" in better and "gain_margin" in worse
+    assert say_tuning(found).result[1:] == [
+        f"design {name}: {x.objective.mean():.4f} of the baseline's objective on 3 fresh machines, "
+        f"worst {x.objective.max():.4f}; on the worst of them gain_margin "
+        f"{x.loop.gain_margin - 0.5:.4g}{stop}"
         for name, x, stop in zip(
             ("gains", "all"), found.judged, ("", "; stopped by peak_voltage"), strict=True
         )
     ]
+    assert found._repr_html_().count("data:image/png;base64,") == 1
     alone = spec.tune.scenarios.model_copy(update={"spread": {}, "machines": {}})
     spec = spec._replace(tune=spec.tune.model_copy(update={"scenarios": alone}))
-    first, *_, last = summary(spec, found)
+    _, first, *_, last = say_tuning(found._replace(spec=spec)).result
     assert "on 3 runs of the nominal machine" in first and "nothing of robustness" in last

@@ -16,6 +16,7 @@ from studies.engine.runs import run_study
 from studies.errors import StudyError
 from studies.explore import explore_results
 from studies.results.labelled import Variables
+from studies.show.pages import page
 from studies.space.spec import parse_sweep
 from studies.store import read_store
 from studies.study import spec as spec_module
@@ -26,6 +27,7 @@ from studies.sweeps.show import ranked_cases
 from studies.tuning import audit as audit_module
 from studies.tuning import results
 from studies.tuning import run as tuning_run
+from studies.tuning import say as say_module
 from studies.tuning.audit import Disagreement
 from studies.tuning.check import JudgedDesign, OwnRun
 from studies.tuning.evaluate import Evaluation, Evaluator
@@ -34,8 +36,8 @@ from studies.tuning.folder import open_tuning
 from studies.tuning.loop_figures import DesignFigures
 from studies.tuning.objective import objective_of
 from studies.tuning.optimise import begin, is_compatible
-from studies.tuning.report import n_outside, rank_correlation, report
 from studies.tuning.run import run_tuning
+from studies.tuning.say import n_outside, rank_correlation, say
 from studies.tuning.spec import load_tuning
 from tests.bare import paper_study, parse_tuning
 from tests.pages import about, parsed, text_of
@@ -261,16 +263,17 @@ def test_a_report_says_what_its_numbers_are():
         0.1,
         14,
     )
-    text = text_of(report(spec, found))
+    text = text_of(page(say(found)))
     head = text.split("## ")[0]
     for words in (
         "the least residual_rms of links 1 and 3 with peak_voltage at most 30",
         "Ended after 14 of 40 iterations: for 12 no family had gained 0.1 %.",
         "residual_rms -50 % (4 instead of 8 µm), settling_time 12 instead of not within 30 ms, "
-        "peak_voltage +0 % (33 instead of 33 V), slowest decay +0 % (70 instead of 70 1/s), "
-        "but gain margin 1.3 (2.3 dB) instead of 3 (9.5 dB) on the nominal machine",
+        "peak_voltage +0 % (33 instead of 33 V), slowest_decay +0 % (70 instead of 70 1/s), "
+        "spillover +0 % (1 instead of 1), "
+        "but gain_margin 1.3 (2.3 dB) instead of 3 (9.5 dB) on the nominal machine",
         "**CAUTION: a gain margin of 1.3; below 2 a machine may go unstable.**",
-        "**A limit is violated.**",
+        "**a limit is violated**",
         "`studies simulate tuned.toml",
     ):
         assert words in head, words
@@ -292,29 +295,23 @@ def loud_and_calm():
         best_objective=np.array([0.5, 0.8]),
     )
     judged = [SimpleNamespace(objective=np.array([share])) for share in (0.5, 0.8)]
-    return spec, SimpleNamespace(at=at, judged=judged)
+    return spec, SimpleNamespace(spec=spec, at=at, judged=judged)
 
 
 def test_a_family_that_keeps_the_limits_comes_before_a_better_one():
     assert best_family(*loud_and_calm()) == 1
 
 
-def test_the_machine_shown_is_the_recommended_one(tmp_path):
+def test_the_machine_shown_is_the_recommended_one():
     spec, found = loud_and_calm()
-    shown = mock.Mock()
-    made_up = {
-        "tuned_study": lambda *x: spec.study.change(control__gain_factor=x[2][0]),
-        "variables": lambda *_: {},
-        "report": lambda *_: "",
-    }
-    draw = mock.Mock()
-    with mock.patch.multiple(tuning_run, sketch=shown, draw=draw, plots=mock.Mock(), **made_up):
-        tuning_run._write(spec, found, tmp_path / "out")
-    draw.call_args[0][1]["machine"]()
-    (study,), _ = shown.call_args
+    made_up = {"tuned_study": lambda *x: spec.study.change(control__gain_factor=x[2][0])}
+    with mock.patch.multiple(say_module, sketch=lambda study: study, **made_up):
+        study = say_module._sketch(found)
     loud, calm = spec.free.values(found.at.best_place)[:, 0]
     assert study.control.gain_factor == calm != loud
-    assert load_study(tmp_path / "out" / "tuned_calm.toml") == study
+    with mock.patch.multiple(tuning_run, **made_up):
+        written = tuning_run.tuned_studies(spec, found.at)["tuned_calm.toml"]
+    assert written == study.change(title=written.title) and "calm" in written.title
 
 
 def test_each_family_has_one_best_start():
@@ -344,7 +341,7 @@ def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
     cli.main(["tune", str(file), "--out", str(out)])
     text = text_of((out / "report.html").read_text(encoding="utf-8"))
     for part in (
-        "which design has the least residual_rms of all links with peak_voltage at most",
+        "Which design has the least residual_rms of all links with peak_voltage at most",
         "| gains |",
         "| loud |",
         "| all, peak_voltage 20 |",
@@ -354,12 +351,12 @@ def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
         "**Next steps:** `studies simulate",
     ):
         assert part in text
-    page = parsed((out / "report.html").read_text())
+    shown = parsed((out / "report.html").read_text())
     for name in ("descent", "gains", "front"):
         assert (out / f"{name}.png").stat().st_size > 10_000 and f"![{name}]" in text
-    assert len(page.images) == 4  # the sketch of the machine, then these
-    assert page.images[0][1].startswith("The machine at its first way-point")
-    assert "[tune.free]" in page.text
+    assert len(shown.images) == 4  # the sketch of the machine, then these
+    assert shown.images[0][1].startswith("The machine at its first way-point")
+    assert "[tune.free]" in shown.text
     tuned = load_study(out / "tuned_gains.toml")
     assert tuned.control.gain_factor != paper_study().control.gain_factor
     check_report(out)

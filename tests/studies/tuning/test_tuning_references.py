@@ -126,7 +126,7 @@ def test_what_is_compared_is_what_its_own_file_gives(compared):
     assert without.endswith(
         f"residual_rms {1e6 * found.uncontrolled.own_run.metrics['residual_rms']:.4g} {before}"
     )
-    assert alone.startswith(f"gain_factor alone, {gain:.4g} instead of 1 (the best of 8 values")
+    assert alone.startswith(f"the best gain_factor alone, {gain:.4g} instead of 1 (of 8 values")
     assert f"{found.gain_alone.objective.mean():.4f} of the baseline's" in alone
     assert alone.endswith(before)
 
