@@ -285,7 +285,11 @@ def _rows(found: ComparedVariants) -> list[list[str]]:
         figures.append(f"{x.rounding:.3g}" if x.word else "no bound")
         if found.board is not None and x.load is not None:
             figures += [str(x.instructions), f"{100 * x.load:.0f} %", str(x.flash)]
-        what = "studies export writes it" if x.is_exportable else _refusal(x)
+        what = "studies export writes it"
+        if x.rounding > ALLOWED_ERROR:
+            what = f"not written: rounding above {ALLOWED_ERROR:g} DAC steps"
+        elif not x.is_exportable:
+            what = "not written: words of 16 bits are only compared"
         rows.append([*start, *figures, what])
     return rows
 
@@ -314,33 +318,23 @@ def _advice(found: ComparedVariants) -> str:
     )
 
 
-def _refusal(x: Variant) -> str:
-    if x.rounding > ALLOWED_ERROR:
-        return f"not written: rounding above {ALLOWED_ERROR:g} DAC steps"
-    return "not written: words of 16 bits are only compared"
-
-
 def say(found: ComparedVariants) -> Report:
     """What a comparison tells."""
     board, heads = found.board, ["sample rate [kHz]", "arithmetic", "gain margin"]
     heads += ["residual rms, worst link [µm]", "rounding, at most [DAC steps]"]
     usable = [x for x in found.variants if x.is_exportable and (x.load is None or x.load < 1)]
-    fit, cost = "", "`studies export DESIGN --compare --pil cortex-m4f --out DIR` counts "
-    cost += "instructions and flash, too."
+    written = f"`studies export` writes {len(usable)} of these {len(found.variants)} controllers"
+    cost = """`studies export DESIGN --compare --pil cortex-m4f --out DIR` counts instructions and
+    flash, too."""
     if board is not None:
         heads += ["instructions", f"load at {board.clock / 1e6:g} MHz", "flash [byte]"]
-        fit = f" and they fit into their sample period on a {board.text}"
-        cost = f"""Instructions of the costliest sample, from the emulator: not cycles, without wait
-        states and interrupts. Load: {board.cycles} cycles an instruction are assumed. Flash: code
-        and constants of controller and shaper."""
+        written += f" and they fit into their sample period on a {board.text}"
+        cost = f"""Instructions of the costliest sample, not cycles; load: {board.cycles} cycles an
+        instruction are assumed; flash: code and constants of controller and shaper."""
     return Report(
         title=f"{found.title or 'untitled study'}: word length and sample rate",
-        result=[
-            _advice(found),
-            f"`studies export` writes {len(usable)} of {len(found.variants)} controllers{fit}",
-        ],
-        question="""how much margin, vibration, time and memory does this controller cost in single
-        precision and in fixed point, at lower and higher sample rates?""",
+        result=[_advice(found), written],
+        question="what does this controller cost in other arithmetics and at other sample rates?",
         next_steps="""set `electronics.sample_rate_hz`, tune at that rate, and export with `--target
         c` or `c-fixed`.""",
         top=[machine(found.study)],
@@ -348,14 +342,13 @@ def say(found: ComparedVariants) -> Report:
             chapter(
                 "Comparison",
                 Rows([*heads, "verdict"], _rows(found)),
-                f"""The same physical gains and filters at each rate; they were not tuned again. In
-                closed loop with the plant in JAX, the compiled code as controller, behind a DAC of
+                f"""The compiled code in closed loop, not tuned again at each rate, behind a DAC of
                 {found.dac_bits} bits in every case. Without control,
                 {1e6 * found.uncontrolled:.4g} µm remain.
-                {f"The study: {found.motion}." if found.motion else ""}""",
-                f"""Rounding: largest error at an actuator that rounding can add up to, whatever the
+                {found.motion and f"The study: {found.motion}."}""",
+                f"""Rounding: largest error at an actuator that it can add up to, whatever the
                 sensors say; {ALLOWED_ERROR} DAC steps are allowed. Single precision has no such
-                bound; see the verification of `--target c`.""",
+                bound.""",
                 cost,
             )
         ],

@@ -103,7 +103,7 @@ def export_design(
     for file in result.files:
         if Path(file).name != file or file.startswith("."):
             raise StudyError(f"--target {target}: it makes {file!r}; expected a plain file name")
-    made = Exported(exported, target, (), result, job.origin)
+    made = Exported(exported, target, (), result, origin=job.origin)
     # files of an earlier export stay unchanged
     texts = {} if made.has_failed else result.files
     if made.verified is not None:

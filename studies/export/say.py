@@ -50,8 +50,7 @@ def say(exported: Exported) -> Report:
             *verified.notes,
             *(_difference(verified, name) for name in verified.runs if name != "JAX"),
         ],
-        question="""does the exported controller behave like the simulated one, sample by sample,
-        over the case's motion and for extreme inputs?""",
+        question="does the exported controller do what the simulated one does, sample by sample?",
         next_steps="""wiring, timing, start-up and sensor faults: `docs/reference/export.md`. Keep
         the amplifiers off until the channels have been checked one by one.""",
         top=[machine(study)],
@@ -119,35 +118,31 @@ def _on_the_processor(exported: Exported) -> Chapter | None:
     target, rate = exported.result.on_target, exported.controller.study.electronics.sample_rate_hz
     if target is None:
         return None
-    built, board, heads = target.built, target.board, ["sequence", "samples"]
+    built, board, ram, loads = target.built, target.board, "", []
     counts = [
         [name, str(len(x)), str(x.min()), f"{np.median(x):.0f}", str(x.max())]
         for name, x in target.instructions.items()
     ]
-    start, share, loads = "The program did not run to its end.", "", []
+    start = "The program did not run to its end."
     if counts:
         worst = target.instructions[target.costliest].max()
         start = f"At most **{worst} instructions a sample** ({target.costliest}), not cycles."
-        share = f"""Share of the sample period at {rate:.6g} Hz, assuming {board.cycles:.3g} cycles
-        an instruction:"""
         for clock in CLOCKS:
             load = board.load(worst, rate, clock)
             slow = ", cannot keep up" if load > 1 else ""
             loads.append([f"{clock / 1e6:g} MHz", f"{100 * load:.0f} %{slow}"])
-    ram = (
-        target.sizes
-        and f"""; RAM: {target.sizes.state} bytes for the controller and
-    {target.sizes.shaper} for the shaper. Stack of a sample: {target.depth} bytes measured"""
-    )
+    if target.sizes is not None:
+        ram = f"""; RAM: {target.sizes.state} bytes for the controller and {target.sizes.shaper} for
+        the shaper. Stack of a sample: {target.depth} bytes measured"""
+    share = f"share of a sample at {rate:.6g} Hz, with {board.cycles:.3g} cycles an instruction"
     return chapter(
         "On the processor",
         f"{board.text}, emulated; {built.version}, -O2. {start}",
-        Rows([*heads, "instructions: least", "median", "most"], counts),
-        share,
-        Rows(["clock", "share"], loads),
+        Rows(["sequence", "samples", "instructions: least", "median", "most"], counts),
+        Rows(["clock", share], loads),
         f"""Flash: {built.flash} bytes of code and constants, {built.firmware} with start-up, main
-        program and the compiler's library{ram or ""}, {built.stack} by the compiler's bound for its
-        own functions, {STACK} reserved. Functions of the compiler's library:
+        program and the compiler's library{ram}, {built.stack} by the compiler's bound for its own
+        functions, {STACK} reserved. Functions of the compiler's library:
         {", ".join(built.library) or "none"}.""",
         "The project next to this page builds the same program: see its `README.md`.",
     )
@@ -158,9 +153,7 @@ def _fixed_point(exported: Exported, verified: Verification) -> Chapter | None:
     if fixed is None or cost is None or not verified.runs:
         return None
     loss, of_dac = (verified.deviation(k).loss for k in ("C, fixed point", "JAX behind the DAC"))
-    unbound = (
-        "The DAC's rounding returns through the feed-through, so no bound holds for the total."
-    )
+    unbound = "The DAC's rounding returns through the feed-through: no bound holds for the total."
     heads, *formats = format_rows(fixed, exported.controller)
     at_limit = "samples with an actuator at its limit", "samples at rest after a fault"
     sequences = []

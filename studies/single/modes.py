@@ -18,7 +18,7 @@ HEADS = ["mode", "frequency [Hz]", "damping ratio [1]", "share of its energy"]
 
 
 def say(modes: NamedModes) -> Report:
-    """What natural modes tell."""
+    """What natural modes tell, on a console and in a notebook."""
     rows = [
         [str(x.mode), f"{x.frequency:.4f}", f"{x.damping_ratio:.5f}", x.description]
         for x in modes.modes
@@ -26,15 +26,8 @@ def say(modes: NamedModes) -> Report:
     drawing = Drawing(
         "modes", "Energy of the lowest modes, by what holds it", partial(_bars, modes)
     )
-    return Report(
-        title="Natural modes of the machine",
-        result=[],
-        question="which natural modes does the machine have at this pose?",
-        next_steps="`studies simulate STUDY` tells which of them a motion excites.",
-        top=[],
-        chapters=[chapter("Modes", Rows(HEADS, rows), drawing)],
-        files={},
-    )
+    shown = chapter("Modes", Rows(HEADS, rows), drawing)
+    return Report("Natural modes of the machine", [], "", "", [], [shown], {})
 
 
 def _bars(modes: NamedModes) -> Figure:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from studies.engine.run_data import chord_deflection
@@ -48,37 +47,28 @@ def deflection(run: Run, twin: Run | None) -> Figure:
     """Deflection of each link: the run, and beside it what the reference trajectory leaves."""
     assert run.result.record is not None
     time, end = 1e3 * run.result.record.time, 1e3 * float(run.result.command_end)
-    windows = run.case.windows
-    start = end + 1e3 * float(windows.residual_delay)
-    window = (start, start + 1e3 * float(windows.residual_length))
+    start = end + 1e3 * float(run.case.windows.residual_delay)
+    window = start, start + 1e3 * float(run.case.windows.residual_length)
+    within = (time >= window[0]) & (time <= window[1])
     bent = [1e6 * chord_deflection(x) for x in (twin, run) if x is not None]
     is_fed_back = run.study.control.feedback != "none"
     styles = [figures.WITHOUT, figures.CONTROLLED if is_fed_back else figures.WITHOUT][-len(bent) :]
-    has_rest = time[-1] > end
-    figure, axes = figures.new_figure(run.study.n_links, 1 + has_rest, 1.4)
-    for link, row in enumerate(axes):
-        for ax in row:
+    figure, axes = figures.new_figure(run.study.n_links, 1 + bool(time[-1] > end), 1.4)
+    for link, (whole, *rest) in enumerate(axes):
+        for ax in (whole, *rest):
             for values, style in zip(bent, styles, strict=True):
                 ax.plot(time, values[:, link], **style)
             ax.margins(x=0.01)
-        row[0].axvline(end, color=GREY, linewidth=0.8, linestyle=":")
-        row[0].set_ylabel(f"link {link + 1} [µm]")
-        if has_rest:
-            is_shown = (time >= window[0]) & (time <= window[1])
-            _zoom(row[1], [x[is_shown, link] for x in bent], (end, time[-1]), window)
+        whole.axvline(end, color=GREY, linewidth=0.8, linestyle=":")
+        whole.set_ylabel(f"link {link + 1} [µm]")
+        for ax in rest:
+            ax.axvspan(*window, color=GREY, alpha=0.12, linewidth=0)
+            ax.set_xlim(end, time[-1])
+            sizes = [np.abs(x[within, link]).max(initial=0.0) for x in bent]
+            if size := max(x if np.isfinite(x) else 0.0 for x in sizes):
+                ax.set_ylim(-1.2 * size, 1.2 * size)
     for ax in axes[-1]:
         ax.set_xlabel("time [ms]")
     if twin is not None:
         figures.legend_above(figure, axes[0, 0])
     return figure
-
-
-def _zoom(
-    ax: Axes, curves: list[np.ndarray], span: tuple[float, float], window: tuple[float, float]
-) -> None:
-    """Limit a panel to a span of time and to the size of what is seen in the residual window."""
-    ax.axvspan(*window, color=GREY, alpha=0.12, linewidth=0)
-    ax.set_xlim(span)
-    size = max((np.abs(x).max() for x in curves if len(x) and np.isfinite(x).all()), default=0)
-    if size > 0:
-        ax.set_ylim(-1.2 * size, 1.2 * size)

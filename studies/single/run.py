@@ -137,14 +137,15 @@ def write_results(
         StudyError: a file cannot be written.
     """
     with publish(out.parent) as staging:
-        write_store(staging / out.name, run_variables(run), run_attributes(run.study))
-        if not has_report:
-            return
-        from studies.show.pages import write_report
-        from studies.single.say import say
+        if has_report:
+            from studies.show.pages import write_report
+            from studies.single.say import say
 
-        write_report(say(run, uncontrolled_twin(run), notes, name, out.stem), staging)
-        (staging / REPORT).rename(staging / f"{out.stem}.html")
+            write_report(say(run, uncontrolled_twin(run), notes, name), staging)
+            for file in [*staging.iterdir()]:
+                end = ".html" if file.name == REPORT else f"-{file.name}"
+                file.rename(staging / f"{out.stem}{end}")
+        write_store(staging / out.name, run_variables(run), run_attributes(run.study))
 
 
 def check_results(out: Path, has_report: bool) -> None:
