@@ -16,7 +16,6 @@ from studies.publish import REPORT, working_folder
 from studies.show.listing import Rows
 from studies.show.pages import write_report
 from studies.show.report import Chapter, Items, Report, chapter, machine
-from studies.show.units import count_text
 from studies.study.margin import caution, margin_in_db
 
 _NOTHING = Verification(checks=[], notes=[], runs={}, exchanges={}, counts={})
@@ -36,8 +35,8 @@ def say(exported: Exported) -> Report:
     failed = [x for x in verified.checks if not x.is_met]
     verdict = "passed" if verified.checks else "nothing was compared"
     verdict = "FAILED, no code was written" if failed else verdict
-    count = len(verified.checks)
-    agree = f"{count - len(failed)} of {count_text(count, 'comparison')} agree"
+    count = f" of {len(verified.checks)}" if failed else ""
+    agree = f"{len(verified.checks) - len(failed)}{count} comparisons agree"
     margin, warning = margin_in_db(loop.gain_margin), caution(loop.gain_margin)
     title, package, law, *wiring = exported.origin
     checks = [[x.what, x.found, x.allowed, "ok" if x.is_met else "FAILED"] for x in verified.checks]
@@ -80,9 +79,7 @@ def _difference(verified: Verification, name: str) -> str:
     at = verified.deviation(name)
     return (
         f"in the loop, {name}: voltage differs by {at.voltage:.2g} V, platform by "
-        f"{' and '.join(f'{1e9 * x:.2g}' for x in at.pose[:2])} nm"
-        f"{''.join(f' and {1e6 * x:.2g} µrad' for x in at.pose[2:])}, residual vibration by "
-        f"{100 * at.loss:+.2g} %"
+        f"{1e9 * at.pose[:2].max():.2g} nm, residual vibration by {100 * at.loss:+.2g} %"
     )
 
 
@@ -90,14 +87,15 @@ def _in_the_loop(exported: FixedController, verified: Verification) -> Chapter |
     if len(verified.runs) < 2:  # JAX alone
         return None
     controller, rows = exported.controller, []
+    heads = "platform against JAX: x, y [nm], phi [urad]", "ADC codes differ from sample"
     for name, run in verified.runs.items():
         rms = " / ".join(f"{1e6 * x:.5f}" for x in np.max(run.result.metrics.residual_rms, axis=1))
-        first = verified.deviation(name).first_code
-        rows.append([name, rms, "never" if first < 0 else str(first)])
-    peak, code = (
-        np.abs(verified.runs["JAX"].voltage).max(),
-        controller.adc_step / controller.adc_gain,
-    )
+        at = verified.deviation(name)
+        apart = at.pose * np.array([1e9, 1e9, 1e6])[: len(at.pose)]
+        first = "never" if at.first_code < 0 else str(at.first_code)
+        rows.append([name, rms, ", ".join(f"{x:.2e}" for x in apart), first])
+    peak = np.abs(verified.runs["JAX"].voltage).max()
+    code = float(controller.adc_step / controller.adc_gain)
     bent = 1e6 * code * np.abs(channel_parts(controller).filter[:, :1]).max(initial=0.0)
     seen = f", up to {bent:.2g} µm in the first controlled channel, whose filter weighs all sensors"
     return chapter(
@@ -105,10 +103,7 @@ def _in_the_loop(exported: FixedController, verified: Verification) -> Chapter |
         f"""The case's motion ({exported.structure.n_steps} samples), the plant in JAX, whose
         controller takes up to {peak:.4g} V, {100 * peak / controller.voltage_limit:.2g} % of the
         limit.""",
-        Rows(
-            ["controller", "residual rms of links 1, 2, 3 [µm]", "ADC codes differ from sample"],
-            rows,
-        ),
+        Rows(["controller", "residual rms of links 1, 2, 3 [µm]", *heads], rows),
         f"""One ADC code stands for {1e3 * code:.3g} mV at a sensor{seen if bent else ""}: residuals
         far below that depend on which code the noise falls on, and differ from run to run.""",
     )
