@@ -6,7 +6,7 @@
   error bounds, `integers` is their arithmetic, `cost` its cost; `c_floating` and `c_fixed` gather
   the values of the C99 templates, which `c_text` fills.
 - Verification: `compiler` makes the code callable, `in_the_loop` runs it with the plant,
-  `sequences` are inputs that no plant would produce, `verify` compares, `report` reports.
+  `sequences` are inputs that no plant would produce, `verify` compares, `say` tells.
 - Processor: `firmware` makes a project of the code, builds it and runs it on an emulated one.
 - `targets` is the table of output formats, each made from a `job`; `run` leads from the design
   to the files.

@@ -42,7 +42,10 @@ def fixed_source(
         count=f"int{wires.word}_t",
         word_bits=wires.word,
         wire="uint16_t",
-        formats=format_lines(fixed, exported),
+        formats=[
+            f"{name:<30}{bits:>4}{base:>20}{room:>9}{reach:>9}".rstrip()
+            for name, bits, base, room, reach in format_rows(fixed, exported)
+        ],
         cost=cost,
         code=wires.sensor_step * 2.0**wires.adc_bits,
         weight=shaper.integers[0],
@@ -87,17 +90,14 @@ def _rows(table: IntegerRow | None, length: int) -> np.ndarray | None:
     return None if table is None else table.integers.reshape(-1, length)
 
 
-def format_lines(fixed: FixedPoint | FixedBlocks, exported: FixedController) -> list[str]:
-    """Table of formats; word range and reach of ADC codes in units of the base."""
-    lines = [
-        f"{'signal':<30}{'Q':>4}{'base':>20}{'room':>9}{'reach':>9}",
-        f"{'sensors':<30}{fixed.wires.adc_bits:>4}{'1 code':>20}",
-    ]
+def format_rows(fixed: FixedPoint | FixedBlocks, exported: FixedController) -> list[list[str]]:
+    """Table of formats, headings first; word range and reach of ADC codes in units of the base."""
+    rows = [["signal", "Q", "base", "room", "reach"]]
+    rows.append(["sensors", str(fixed.wires.adc_bits), "1 code", "", ""])
     for m, name in enumerate(exported.channels.names):
         for text, form, unit in fixed.formats:
-            unit = unit if exported.is_modal else "V"
-            lines.append(
-                f"{f'{text}, {name}':<30}{form.bits[m]:>4}{f'{form.base[m]:.9e} {unit}':>20}"
-                f"{form.largest[m] / form.base[m]:>9.0f}{form.bound[m] / form.base[m]:>9.1f}"
-            )
-    return lines
+            base, bits = form.base[m], str(form.bits[m])
+            shown = f"{base:.9e} {unit if exported.is_modal else 'V'}"
+            room, reach = f"{form.largest[m] / base:.0f}", f"{form.bound[m] / base:.1f}"
+            rows.append([f"{text}, {name}", bits, shown, room, reach])
+    return rows

@@ -28,11 +28,13 @@ from studies.export.floating import respond
 from studies.export.in_the_loop import LoopRun, law_of, run_in_the_loop
 from studies.export.job import check_loop
 from studies.export.run import checked_bits, checked_board
+from studies.export.say import whole_page
 from studies.export.verify import load_code, reference_run
 from studies.publish import announce, check_folder, publish, shown, working_folder
 from studies.results.document import json_text
 from studies.results.labelled import Labelled, derived, labelled, told, unwritten
-from studies.show.pages import old_page as page
+from studies.show.listing import Rows
+from studies.show.report import Report, chapter, machine, print_result
 from studies.study.margin import margin_text
 from studies.study.spec import Study
 
@@ -147,8 +149,9 @@ def compare_variants(
         uncontrolled=uncontrolled,
     )
     with publish(out) as staging:
-        (staging / PAGE).write_text(_page(found), encoding="utf-8")
+        (staging / PAGE).write_text(whole_page(report := say(found)), encoding="utf-8")
         (staging / DOCUMENT).write_text(json_text(found), encoding="utf-8")
+    print_result(report, console)
     announce(console, out / PAGE)
     return found
 
@@ -282,7 +285,11 @@ def _rows(found: ComparedVariants) -> list[list[str]]:
         figures.append(f"{x.rounding:.3g}" if x.word else "no bound")
         if found.board is not None and x.load is not None:
             figures += [str(x.instructions), f"{100 * x.load:.0f} %", str(x.flash)]
-        what = "studies export writes it" if x.is_exportable else _refusal(x)
+        what = "studies export writes it"
+        if x.rounding > ALLOWED_ERROR:
+            what = f"not written: rounding above {ALLOWED_ERROR:g} DAC steps"
+        elif not x.is_exportable:
+            what = "not written: words of 16 bits are only compared"
         rows.append([*start, *figures, what])
     return rows
 
@@ -311,21 +318,39 @@ def _advice(found: ComparedVariants) -> str:
     )
 
 
-def _refusal(x: Variant) -> str:
-    if x.rounding > ALLOWED_ERROR:
-        return f"not written: rounding above {ALLOWED_ERROR:g} DAC steps"
-    return "not written: words of 16 bits are only compared"
-
-
-def _page(found: ComparedVariants) -> str:
+def say(found: ComparedVariants) -> Report:
+    """What a comparison tells."""
+    board, heads = found.board, ["sample rate [kHz]", "arithmetic", "gain margin"]
+    heads += ["residual rms, worst link [µm]", "rounding, at most [DAC steps]"]
     usable = [x for x in found.variants if x.is_exportable and (x.load is None or x.load < 1)]
-    return page(
-        "export/comparison.html",
-        None,
-        found.study,
-        found=found,
-        rows=_rows(found),
-        usable=len(usable),
-        advice=_advice(found),
-        allowed=ALLOWED_ERROR,
+    written = f"`studies export` writes {len(usable)} of these {len(found.variants)} controllers"
+    cost = """`studies export DESIGN --compare --pil cortex-m4f --out DIR` counts instructions and
+    flash, too."""
+    if board is not None:
+        heads += ["instructions", f"load at {board.clock / 1e6:g} MHz", "flash [byte]"]
+        written += f" and they fit into their sample period on a {board.text}"
+        cost = f"""Instructions of the costliest sample, not cycles; load: {board.cycles} cycles an
+        instruction are assumed; flash: code and constants of controller and shaper."""
+    return Report(
+        title=f"{found.title or 'untitled study'}: word length and sample rate",
+        result=[_advice(found), written],
+        question="what does this controller cost in other arithmetics and at other sample rates?",
+        next_steps="""set `electronics.sample_rate_hz`, tune at that rate, and export with `--target
+        c` or `c-fixed`.""",
+        top=[machine(found.study)],
+        chapters=[
+            chapter(
+                "Comparison",
+                Rows([*heads, "verdict"], _rows(found)),
+                f"""The compiled code in closed loop, not tuned again at each rate, behind a DAC of
+                {found.dac_bits} bits in every case. Without control,
+                {1e6 * found.uncontrolled:.4g} µm remain.
+                {found.motion and f"The study: {found.motion}."}""",
+                f"""Rounding: largest error at an actuator that it can add up to, whatever the
+                sensors say; {ALLOWED_ERROR} DAC steps are allowed. Single precision has no such
+                bound.""",
+                cost,
+            )
+        ],
+        files={"Study file": found.study},
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -22,6 +23,7 @@ from studies.export.fixed import FixedPoint, rail_samples
 from studies.export.fixed_blocks import FixedBlocks
 from studies.export.in_the_loop import LoopRun
 from studies.export.verify import Verification, reference_run
+from studies.publish import shown
 from studies.study.labels import describe
 
 
@@ -48,6 +50,34 @@ class ExportResult(NamedTuple):
     fixed: FixedPoint | FixedBlocks | None = None
     cost: Cost | None = None
     on_target: OnTarget | None = None
+
+
+class Exported(NamedTuple):
+    """An export."""
+
+    controller: FixedController
+    target: str
+    files: tuple[Path, ...]  # those written: without the controller if a comparison failed
+    result: ExportResult
+    origin: list[str]  # where it comes from, in lines
+
+    @property
+    def verified(self) -> Verification | None:
+        """What was compared; None: nothing was."""
+        return self.result.verified
+
+    @property
+    def is_good(self) -> bool:
+        """Whether everything agreed; not so where nothing was compared."""
+        return self.verified is not None and self.verified.is_passed
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether a comparison failed: then the controller is not written."""
+        return self.verified is not None and self.verified.has_failed
+
+    def _repr_html_(self) -> str:
+        return shown(self)
 
 
 def check_loop(

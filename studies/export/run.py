@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import NamedTuple
 
 from rich.console import Console
 
@@ -17,39 +16,17 @@ from studies.export.compiler import NO_COMPILER, find_compiler
 from studies.export.document import study_hash
 from studies.export.firmware.boards import BOARDS, Board
 from studies.export.firmware.build import check_tools
-from studies.export.job import ExportResult, Job
-from studies.export.report import report
+from studies.export.job import Exported, ExportResult, Job
+from studies.export.say import say, whole_page
 from studies.export.targets import TARGETS
-from studies.export.verify import Verification
-from studies.publish import check_folder, publish, shown
+from studies.publish import check_folder, publish
+from studies.show.report import print_result
 from studies.study.spec import Study
 
 REPORT, FAILED = "verification.html", "verification-failed.html"
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,30}")
 _DAC_BITS = (4, 16)
 DAC_BITS = 12
-
-
-class Exported(NamedTuple):
-    """An export."""
-
-    controller: FixedController
-    target: str
-    files: tuple[Path, ...]  # those written: without the controller if a comparison failed
-    verified: Verification | None  # None: nothing was compared
-
-    @property
-    def is_good(self) -> bool:
-        """Whether everything agreed; not so where nothing was compared."""
-        return self.verified is not None and self.verified.is_passed
-
-    @property
-    def has_failed(self) -> bool:
-        """Whether a comparison failed: then the controller is not written."""
-        return self.verified is not None and self.verified.has_failed
-
-    def _repr_html_(self) -> str:
-        return shown(self)
 
 
 def export_design(
@@ -126,19 +103,19 @@ def export_design(
     for file in result.files:
         if Path(file).name != file or file.startswith("."):
             raise StudyError(f"--target {target}: it makes {file!r}; expected a plain file name")
-    verified = result.verified
-    has_failed = verified is not None and verified.has_failed
-    texts = {} if has_failed else result.files  # files of an earlier export stay unchanged
-    if verified is not None:
-        text = report(exported, job.origin, result)
-        texts |= {FAILED if has_failed else REPORT: text}
-        _print_verdict(verified, console)
-    with publish(out, stale=() if has_failed else (REPORT, FAILED)) as staging:
+    made = Exported(exported, target, (), result, origin=job.origin)
+    # files of an earlier export stay unchanged
+    texts = {} if made.has_failed else result.files
+    if made.verified is not None:
+        report = say(made)
+        texts |= {FAILED if made.has_failed else REPORT: whole_page(report)}
+        print_result(report, console)
+    with publish(out, stale=() if made.has_failed else (REPORT, FAILED)) as staging:
         for file, text in texts.items():
             (staging / file).write_text(text, encoding="utf-8")
     for file in texts:
         console.print(f"written: {out / file}", soft_wrap=True)
-    return Exported(exported, target, tuple(out / file for file in texts), verified)
+    return made._replace(files=tuple(out / file for file in texts))
 
 
 def _is_result(found: object) -> bool:
@@ -212,20 +189,3 @@ def _origin(exported: FixedController, case_id: str) -> list[str]:
         f"velocity estimate {study.electronics.estimator}, shaper {study.shaper.kind}",
         *wiring,
     ]
-
-
-def _print_verdict(verified: Verification, console: Console) -> None:
-    failed = [check for check in verified.checks if not check.is_met]
-    for check in failed:
-        console.print(f"FAILED: {check.what}: {check.found}, allowed {check.allowed}")
-    if not failed:
-        console.print(f"verified: {len(verified.checks)} comparisons agree")
-    for note in verified.notes:
-        console.print(note, soft_wrap=True)
-    for name in verified.runs:
-        if name != "JAX":
-            at = verified.deviation(name)
-            console.print(
-                f"in the loop, {name}: voltage differs by {at.voltage:.2g} V, platform by "
-                f"{1e9 * at.pose[:2].max():.2g} nm, residual vibration by {100 * at.loss:+.2g} %"
-            )

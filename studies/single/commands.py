@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from studies.config import start
 from studies.errors import field_error
@@ -16,7 +15,7 @@ from studies.publish import announce
 from studies.results.document import AsJson, print_document
 
 if TYPE_CHECKING:
-    from studies.engine.runs import Run
+    from studies.show.report import Report
 
 _Report = Annotated[
     bool,
@@ -42,6 +41,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         start(precision)
         from studies.engine.runs import uncontrolled_twin
         from studies.single.run import simulate as simulate_study
+        from studies.single.say import say
 
         run = simulate_study(study, out, report, margins)
         if as_json:
@@ -49,7 +49,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
             print_document(run_document(run, uncontrolled_twin(run)))
         else:
-            _print_run(run, uncontrolled_twin(run), console)
+            _print_report(say(run, uncontrolled_twin(run)), console)
             _print_files(out, report, console)
         if run.status:
             sys.exit(1)
@@ -106,6 +106,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         """Natural frequencies and damping ratios of the assembled machine."""
         start()
         from studies.engine.modes import machine_modes
+        from studies.single.modes import say
         from studies.study.spec import load_study
 
         result = machine_modes(
@@ -125,11 +126,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             console.print(
                 "the paper's machine without damping; with it: studies modes paper", soft_wrap=True
             )
-        table = Table("mode", "frequency [Hz]", "damping ratio [1]", "share of its energy")
-        for row in result.modes:
-            numbers = f"{row.frequency:.4f}", f"{row.damping_ratio:.5f}"
-            table.add_row(str(row.mode), *numbers, row.description)
-        console.print(table)
+        _print_report(say(result), console)
 
     @app.command()
     def plant(
@@ -161,65 +158,17 @@ def _numbers(option: str, written: str) -> tuple[float, ...]:
         raise field_error(option, written, "numbers with commas between them") from None
 
 
-def _print_run(run: Run, twin: Run | None, console: Console) -> None:
-    """Print status, link metrics and stability; twin: the same run without control."""
-    from jaxmodel.loop_figures import MARGIN_MODES
-    from studies.engine.poles import HEADER, difference, pole_rows
-    from studies.show.listing import print_rows
-    from studies.single.summary import limits_text, link_rows, machine_notes
-    from studies.study.labels import describe, remedy
-    from studies.study.margin import (
-        caution,
-        hysteresis_text,
-        margin_in_db,
-        robustness_text,
-        stretch_text,
-    )
-    from studies.study.spec import AUTO
+def _print_report(report: Report, console: Console) -> None:
+    """Print the result, and the texts and tables below it."""
+    from studies.show.listing import Rows, print_rows
+    from studies.show.report import print_result
 
-    windows = run.case.windows
-    console.print(f"status: {describe(run.status)}")
-    if text := limits_text(run):
-        console.print(f"[bold red]{text}[/]", soft_wrap=True, markup=True)
-    if advice := remedy(run.status):
-        console.print(f"next step: {advice}", soft_wrap=True)
-    print_rows(link_rows(run, twin), console)
-    for note in machine_notes(run):
-        console.print(note, soft_wrap=True)
-    settled = run.study.metrics.residual_delay == AUTO
-    console.print(
-        "deflections: at the worst station; residual window: "
-        f"{1e3 * float(windows.residual_length):.4g} ms, from "
-        f"{1e3 * float(windows.residual_delay):.4g} ms after the reference trajectory"
-        + (", when the drives have settled to 2 %" if settled else ""),
-        soft_wrap=True,
-    )
-    if text := hysteresis_text(run.study.patches.hysteresis):
-        console.print(text, soft_wrap=True)
-    if run.loop is None:
-        return
-    damping = ", ".join(f"{zeta:.3g}" for zeta in run.loop.damping_ratio.min(axis=1))
-    modes = run.study.link.modes
-    console.print(
-        "gain margin of the linearised sampled loop, a factor on control.gain_factor: "
-        f"{margin_in_db(run.loop.gain_margin)}; damping "
-        f"ratios of modes 1, 2, ..., the smallest of the links: {damping} "
-        f"({max(MARGIN_MODES, modes)} plant modes per link, the run {modes})",
-        soft_wrap=True,
-    )
-    console.print(stretch_text(run.loop.by_stretch), soft_wrap=True)
-    if run.loop.robustness:
-        console.print(robustness_text(run.loop.robustness), soft_wrap=True)
-    if run.poles is not None:
-        poles = Table(*HEADER)
-        for row in pole_rows(run.poles):
-            poles.add_row(*row)
-        console.print(poles)
-        console.print(difference(run.poles), soft_wrap=True)
-    if run.loop.breaking:
-        console.print(f"beyond the gain margin goes unstable: {run.loop.breaking}", soft_wrap=True)
-    if warning := caution(run.loop.gain_margin):
-        console.print(f"[bold red]{warning}[/]", soft_wrap=True, markup=True)
+    print_result(report, console)
+    for part in [*report.parts, report.caveat]:
+        if isinstance(part, Rows):
+            print_rows(part, console)
+        elif isinstance(part, str) and part:
+            console.print(" ".join(part.replace("`", "").split()), soft_wrap=True)
 
 
 def _print_files(out: Path | None, has_report: bool, console: Console) -> None:

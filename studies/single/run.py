@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +12,7 @@ from studies.engine.design import deviations, load_design
 from studies.engine.run_data import run_attributes, run_variables
 from studies.engine.runs import Run, run_study, uncontrolled_twin
 from studies.errors import StudyError
-from studies.publish import check_target, publish
+from studies.publish import REPORT, check_target, publish
 from studies.show.units import count_text
 from studies.store import write_store
 from studies.study.labels import describe
@@ -138,18 +137,15 @@ def write_results(
         StudyError: a file cannot be written.
     """
     with publish(out.parent) as staging:
-        write_store(staging / out.name, run_variables(run), run_attributes(run.study))
-        if not has_report:
-            return
-        from studies.show.figures import draw
-        from studies.show.sketch import sketch
-        from studies.single.report import drawings, report
+        if has_report:
+            from studies.show.pages import write_report
+            from studies.single.say import say
 
-        twin = uncontrolled_twin(run)
-        plots = drawings(run, twin) | {"machine": partial(sketch, run.study)}
-        draw(staging, {f"{out.stem}-{kind}": plot for kind, plot in plots.items()})
-        text = report(out.stem, run, twin, notes, name, staging)
-        (staging / f"{out.stem}.html").write_text(text, encoding="utf-8")
+            write_report(say(run, uncontrolled_twin(run), notes, name), staging)
+            for file in [*staging.iterdir()]:
+                end = ".html" if file.name == REPORT else f"-{file.name}"
+                file.rename(staging / f"{out.stem}{end}")
+        write_store(staging / out.name, run_variables(run), run_attributes(run.study))
 
 
 def check_results(out: Path, has_report: bool) -> None:

@@ -1,7 +1,6 @@
 """Results as notebooks show them, and the progress of long commands there."""
 
 import io
-from pathlib import Path
 from types import SimpleNamespace
 
 import IPython.display
@@ -9,11 +8,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from studies.cards import CARDS
+from studies.cards import CARDS, SAY
 from studies.engine.modes import NamedModes
 from studies.engine.progress import Phases
 from studies.engine.runs import run_study
-from studies.export.run import Exported
+from studies.engine.stability import LoopFigures
+from studies.export.comparison import ComparedVariants, Variant
+from studies.export.job import Exported, ExportResult
 from studies.export.verify import Check, Verification
 from tests.canonical import MACHINE, study_of
 from tests.studies.show.test_findings import certificate
@@ -26,7 +27,8 @@ def results():
     """One of each kind, the run a true one."""
     study = study_of(MACHINE, title=TITLE)
     check = Check("voltages", "1e-16 V", "1e-12 V", True)
-    verified = Verification([check], [], {}, {}, {})
+    loop = LoopFigures(spectral_radius=0.99, gain_margin=3.0)
+    made = ExportResult({}, loop, Verification([check], [], {}, {}, {}))
     shares = np.zeros((2, 3, 3))
     shares[1, 0, 0] = 0.9
     return {
@@ -40,17 +42,28 @@ def results():
             turn_share=np.zeros(2),
         ),
         "Certificate": certificate(study=study),
-        "Exported": Exported(SimpleNamespace(study=study), "json", (Path("x.json"),), verified),
+        "Exported": Exported(SimpleNamespace(study=study), "json", (), made, ["", "", ""]),
+        "ComparedVariants": ComparedVariants(
+            out=None,
+            study=study,
+            motion="",
+            board=None,
+            dac_bits=12,
+            variants=(Variant(1e4, 0, gain_margin=2.5, residual_rms=1e-7),),
+            uncontrolled=1e-5,
+        ),
     }
 
 
-@pytest.mark.parametrize("name", ["Run", "NamedModes", "Certificate", "Exported"])
+@pytest.mark.parametrize(
+    "name", ["Run", "NamedModes", "Certificate", "Exported", "ComparedVariants"]
+)
 def test_a_result_shows_itself(results, name):
     result = results[name]
-    assert type(result).__name__ == name and name in CARDS
+    assert type(result).__name__ == name and name in CARDS | SAY
     html = result._repr_html_()
     assert "<script" not in html and html.count("data:image/png;base64,") == 1
-    assert ("&lt;script&gt;" in html) == (name != "NamedModes")
+    assert ("&lt;script&gt;" in html) == (name not in ("NamedModes", "Certificate"))  # no title
     assert len(html) < 1e5
 
 

@@ -28,7 +28,7 @@ import studies
 from studies import cli, sources
 from studies.cli import app, console, main
 from studies.engine.modes import machine_modes
-from studies.single.summary import machine_notes
+from studies.single.say import machine_notes
 from studies.study.files import READY
 from studies.study.margin import margin_in_db
 from studies.study.spec import load_study

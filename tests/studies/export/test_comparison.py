@@ -141,7 +141,7 @@ def test_a_rate_without_controller_has_a_row(tmp_path):
     study = write_study(tmp_path / "strong.toml", strong)
     variants, table = compared(study, tmp_path / "out")
     page = text_of((tmp_path / "out" / "comparison.html").read_text())
-    assert "--pil cortex-m4f" in page and "none keeps a gain margin of 2" in page
+    assert "--pil cortex-m4f" in page and "None keeps a gain margin of 2" in page
     assert not any(x["is_exportable"] for x in variants)
     assert all("control.gain_factor = 5" in x["fault"] for x in variants)
     assert table["gain margin"] == [""] * 3

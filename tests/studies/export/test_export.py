@@ -89,7 +89,11 @@ def test_export_is_verified(capsys, designs, folders, name, target):
         loss = float(re.search(r"Residual vibration: ([+-][\d.]+) % against", report)[1])
         assert abs(loss) < 100 * AIM
         assert re.search(r"\| bit by bit, recorded codes \| 0 of \d+ codes differ", report)
-        assert re.search(r"\n`signal {20,}Q {10,}base +room +reach\nsensors {20,}", report)
+        assert re.search(
+            r"\n\| signal \| Q \| base \| room \| reach \|\n\| sensors \| \d+ \|", report
+        )
+        code = (out / "flexlink.c").read_text()
+        assert re.search(r"\bsignal {20,}Q {10,}base +room +reach\n.*\bsensors {20,}", code)
     else:
         found = [
             float(x) for x in re.findall(r"open loop, [^|]*codes \| ([\d.e+-]+) \| 1e-12", report)

@@ -11,7 +11,7 @@ from jaxmodel.state_space import StateSpace
 from studies.engine.blocks import ModalBlocks
 from studies.engine.design import Design, as_design
 from studies.export.floating import respond
-from studies.export.run import Exported
+from studies.export.job import Exported, ExportResult
 from studies.export.verify import DOUBLE, WORST, Check, Verification, _limits, compare_values
 
 NOTHING = Verification(checks=[], notes=[], runs={}, exchanges={}, counts={})
@@ -28,7 +28,7 @@ GOOD, BAD = Check("codes", "0", "0", True), Check("codes", "1", "0", False)
     ],
 )
 def test_an_export_is_good_only_if_something_was_compared(verified, is_good, has_failed):
-    made = Exported(None, "json", (), verified)
+    made = Exported(None, "json", (), ExportResult({}, None, verified), [])
     assert (made.is_good, made.has_failed) == (is_good, has_failed)
 
 

@@ -1,0 +1,44 @@
+"""What natural modes tell: frequency, damping and what moves, of each."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from studies.engine.modes import NamedModes
+from studies.show import figures
+from studies.show.listing import Rows
+from studies.show.report import Drawing, Report, chapter
+
+#: Modes in the figure.
+MOST = 12
+HEADS = ["mode", "frequency [Hz]", "damping ratio [1]", "share of its energy"]
+
+
+def say(modes: NamedModes) -> Report:
+    """What natural modes tell, on a console and in a notebook."""
+    rows = [
+        [str(x.mode), f"{x.frequency:.4f}", f"{x.damping_ratio:.5f}", x.description]
+        for x in modes.modes
+    ]
+    drawing = Drawing(
+        "modes", "Energy of the lowest modes, by what holds it", partial(_bars, modes)
+    )
+    shown = chapter("Modes", Rows(HEADS, rows), drawing)
+    return Report("Natural modes of the machine", [], "", "", [], [shown], {})
+
+
+def _bars(modes: NamedModes) -> Figure:
+    figure, ax = figures.one_panel(2.0)
+    shares = np.array([*modes.link_share.sum(axis=2).T, modes.drive_share])[:, :MOST]
+    shares = 100 * np.nan_to_num(shares)
+    for k, share in enumerate(shares):
+        name = f"link {k + 1}" if k < len(shares) - 1 else "drive"
+        place, base = np.arange(len(share)), shares[:k].sum(axis=0)
+        ax.bar(place, share, bottom=base, color=figures.SERIES[k], label=name)
+    ax.set_xticks(place, [f"{f:.0f}" for f in modes.frequency[:MOST]])
+    ax.set(xlabel="frequency [Hz]", ylabel="energy [%]")
+    figures.legend_above(figure, ax)
+    return figure
