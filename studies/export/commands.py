@@ -11,6 +11,7 @@ from rich.console import Console
 
 from studies.config import start
 from studies.errors import StudyError
+from studies.options import Case, Design, Out
 
 
 def add_commands(app: typer.Typer, console: Console) -> None:
@@ -18,15 +19,12 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
     @app.command()
     def export(
-        design: Annotated[Path, typer.Argument(help="study file, folder of a tuning or a sweep")],
-        out: Annotated[Path, typer.Option(help="folder for the files")],
+        design: Design,
+        out: Out,
         target: Annotated[
             str | None, typer.Option(help="json, c, or c-fixed (32-bit fixed point)")
         ] = None,
-        case: Annotated[
-            str | None,
-            typer.Option(help="case of a sweep (number or id:...) or family of a tuning"),
-        ] = None,
+        case: Case = None,
         verify: Annotated[
             bool | None,
             typer.Option(

@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 
 from studies.config import start
+from studies.options import Out, Pdf
 
 
 def add_commands(app: typer.Typer, console: Console) -> None:
@@ -19,8 +20,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         data: Annotated[
             Path, typer.Argument(help="file of a fit (TOML), or the name of a ready-made one")
         ],
-        out: Annotated[Path, typer.Option(help="folder for report, fitted study and figures")],
-        pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
+        out: Out,
+        pdf: Pdf = False,
         explore: Annotated[
             bool,
             typer.Option(

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from base64 import b64encode
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from hashlib import sha256
@@ -31,16 +31,15 @@ from studies.publish import FAULT, REPORT
 from studies.show import figures
 from studies.show.listing import Rows
 from studies.show.report import Drawing, Report, sentence
-from studies.show.units import count_text, headed, number, span
-from studies.study.entries import links_text
-from studies.study.labels import describe
-from studies.study.margin import GUESSED, margin_in_db, robustness_text
+from studies.study.margin import GUESSED
 from studies.study.spec import Study
 from studies.study.template import own_text, study_template
 
 _ROOT = Path(__file__).parents[1]
 #: Where a name in a table may go on in the next line.
 _JOINT = re.compile(r"(?<=[A-Za-z][_./])(?=\w)|(?<=\w)(?=\[)")
+#: Words that are code or strong.
+_MARKED = re.compile(r"`([^`]+)`|\*\*(.+?)\*\*")
 #: Images with more pixels than this across keep a readable width on a narrow screen.
 WIDE = 550
 #: Rows of a card's table, and width [inch] and resolution [1/inch] of its picture.
@@ -52,31 +51,26 @@ def _short(value: float, digits: int = 4) -> str:
     return f"{value:.{digits}g}"
 
 
-def _percent(share: float, digits: int = 3) -> str:
-    return f"{100 * share:.{digits}g} %"
-
-
-def _change(after: float, before: float) -> str:
-    """A relative change in percent."""
-    return f"{100 * (after / before - 1):+.3g} %"
-
-
-def _breakable(text: str) -> str:
+def _breakable(text: str) -> Markup:
     """A text with places to break long names, so that a table of many columns fits the page."""
-    if isinstance(text, Markup):
-        return text
-    return Markup("<wbr>").join(_JOINT.split(text))
+    return Markup("<wbr>").join(_JOINT.split(_unbroken(text)))
 
 
-def _unbroken(text: str) -> Markup:
-    """Keep a number and its sign on one line."""
-    return Markup(re.sub(" (?=[%†])", "\N{NO-BREAK SPACE}", str(text)))
+def _unbroken(text: str) -> str:
+    """A text with each number and its sign on one line."""
+    return re.sub(" (?=[%†])", "\N{NO-BREAK SPACE}", text)
 
 
 def prose(text: str) -> Markup:
     """A text of this program, with `code` and **strong** words, in one piece."""
-    shown = re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(" ".join(text.split()))))
-    return _unbroken(re.sub(r"\*\*([^*]+)\*\*", r"<b>\1</b>", shown))
+    return Markup(_marked(str(escape(_unbroken(" ".join(text.split()))))))
+
+
+def _marked(text: str) -> str:
+    def mark(found: re.Match[str]) -> str:
+        return f"<code>{found[1]}</code>" if found[1] else f"<b>{_marked(found[2])}</b>"
+
+    return _MARKED.sub(mark, text)
 
 
 def _anchor(title: str) -> str:
@@ -87,19 +81,7 @@ def _anchor(title: str) -> str:
 #: How templates write values: `{{ value | name }}`.
 FILTERS: dict[str, Callable[..., str]] = {
     "short": _short,
-    "percent": _percent,
-    "change": _change,
-    "number": number,
-    "count": count_text,
-    "headed": headed,
-    "span": span,
-    "links": links_text,
-    "margin": margin_in_db,
-    "robustness": robustness_text,
-    "status": describe,
     "breakable": _breakable,
-    "unbroken": _unbroken,
-    "code": prose,
     "prose": prose,
     "sentence": sentence,
     "anchor": _anchor,
@@ -118,7 +100,6 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
     )
     environment.filters.update(FILTERS)
-    environment.globals["left_out"] = GUESSED
     return environment
 
 
@@ -153,7 +134,7 @@ def page(report: Report, folder: Path | None = None) -> str:
     about = next((x for x in report.files.values() if isinstance(x, Study)), None)
     return render(
         "show/page.html",
-        report=replace(report, chapters=chapters),
+        report=replace(report, chapters=chapters, caveat=report.caveat or GUESSED),
         script=Markup(script),
         digest=b64encode(sha256(script.encode()).digest()).decode(),
         image=lambda name, caption: _image(folder, name, caption),
@@ -194,47 +175,6 @@ def _png(figure: Figure) -> bytes:
     image = BytesIO()
     figure.savefig(image, format="png", dpi=CARD_DPI)
     return image.getvalue()
-
-
-def old_page(
-    name: str,
-    folder: Path | None,
-    appended: Study | Mapping[str, Study | str],
-    /,
-    **values: Any,
-) -> str:
-    """A report as a self-contained web page.
-
-    Args:
-        name: of its template.
-        folder: with its figures, PNG or GIF; None: a page without images.
-        appended: studies and texts to append, by title; or the study reported on. The first study
-            is that whose verification counts.
-        values: of the template.
-
-    Returns:
-        HTML.
-
-    Raises:
-        ValueError: a figure that is not in the folder.
-    """
-    titles: list[str] = []
-
-    def section(title: str) -> Markup:
-        titles.append(title)
-        return Markup('<h2 id="{}">{}</h2>').format(_anchor(title), title)
-
-    files = {"Study file": appended} if isinstance(appended, Study) else appended
-    about = next((x for x in files.values() if isinstance(x, Study)), None)
-    return render(
-        name,
-        **values,
-        section=section,
-        titles=titles,
-        image=lambda file, caption: _image(folder, file, caption),
-        facts=config.origin() | _verified(about),
-        files={title: _file(content) for title, content in files.items()},
-    )
 
 
 def _file(content: Study | str) -> tuple[str, str]:

@@ -11,6 +11,7 @@ from rich.console import Console
 
 from studies.config import start
 from studies.errors import field_error
+from studies.options import Design, Precision
 from studies.publish import announce
 from studies.results.document import AsJson, print_document
 
@@ -34,7 +35,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         margins: Annotated[
             bool, typer.Option("--margins", help="also disk, phase and delay margin of the loop")
         ] = False,
-        precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
+        precision: Precision = "float64",
         as_json: AsJson = False,
     ) -> None:
         """Run one study and print its metrics; with --out, also save full trajectories."""
@@ -56,7 +57,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
     @app.command()
     def replay(
-        design: Annotated[Path, typer.Argument(help="study file, folder of a tuning or a sweep")],
+        design: Design,
         case: Annotated[
             str | None, typer.Option(help="case number, or id: and digits of the case's id")
         ] = None,
@@ -130,7 +131,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
     @app.command()
     def plant(
-        design: Annotated[Path, typer.Argument(help="study file, folder of a tuning or a sweep")],
+        design: Design,
         out: Annotated[Path, typer.Option(help="NPZ, MAT or JSON file")],
         case: Annotated[
             str | None, typer.Option(help="case number, or id: and digits of the case's id")

@@ -18,6 +18,7 @@ from studies.cluster.connect import (
 )
 from studies.config import start
 from studies.errors import StudyError
+from studies.options import MaybeOut, Quiet, Resume
 
 if TYPE_CHECKING:
     from studies.tuning.spec import TuneSpec
@@ -31,10 +32,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         spec: Annotated[
             Path, typer.Argument(help="tuning file (TOML), or `tune`, a ready-made one")
         ],
-        out: Annotated[Path | None, typer.Option(help="folder for the results")] = None,
-        resume: Annotated[
-            bool, typer.Option("--resume", help="continue an interrupted run, if there is one")
-        ] = False,
+        out: MaybeOut = None,
+        resume: Resume = False,
         audit: Annotated[
             bool, typer.Option("--audit", help="only check derivatives against finite differences")
         ] = False,
@@ -44,7 +43,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
                 "--explore", help="also write explorer.html, to look at all starting points"
             ),
         ] = False,
-        quiet: Annotated[bool, typer.Option("--quiet", help="hide progress")] = False,
+        quiet: Quiet = False,
         scheduler: Scheduler = None,
         local_workers: LocalWorkers = None,
         worker_timeout: WorkerTimeout = TIMEOUT,
