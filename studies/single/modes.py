@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 from matplotlib.figure import Figure
 
 from studies.engine.modes import NamedModes
 from studies.show import figures
 from studies.show.listing import Rows
-from studies.show.report import Drawing, Report, chapter
+from studies.show.report import Report, chapter, drawing
 
 #: Modes in the figure.
 MOST = 12
@@ -23,14 +21,12 @@ def say(modes: NamedModes) -> Report:
         [str(x.mode), f"{x.frequency:.4f}", f"{x.damping_ratio:.5f}", x.description]
         for x in modes.modes
     ]
-    drawing = Drawing(
-        "modes", "Energy of the lowest modes, by what holds it", partial(_bars, modes)
-    )
-    shown = chapter("Modes", Rows(HEADS, rows), drawing)
+    shown = chapter("Modes", Rows(HEADS, rows), drawing(_bars, modes, name="modes"))
     return Report("Natural modes of the machine", [], "", "", [], [shown], {})
 
 
 def _bars(modes: NamedModes) -> Figure:
+    """Energy of the lowest modes, by what holds it."""
     figure, ax = figures.one_panel(2.0)
     shares = np.array([*modes.link_share.sum(axis=2).T, modes.drive_share])[:, :MOST]
     shares = 100 * np.nan_to_num(shares)

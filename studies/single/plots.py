@@ -16,14 +16,14 @@ POSE = ("x [µm]", "y [µm]", "φ [µrad]")
 
 
 def pose_error(run: Run) -> Figure:
-    """Pose of the platform minus the reference trajectory."""
+    """Platform: pose minus reference trajectory."""
     assert run.result.record is not None
     error = 1e6 * run.result.record.pose_error.T[..., None]
     return _over_time(run, dict(zip(POSE, error, strict=False)), [])
 
 
 def voltage(run: Run) -> Figure:
-    """Voltages of the actuators of each link."""
+    """Actuator voltages, numbered from the actuated joint outwards."""
     assert run.result.record is not None
     volts = run.result.record.actuator_voltage
     rows = {f"link {i + 1} [V]": volts[:, i] for i in range(run.study.n_links)}
@@ -44,7 +44,11 @@ def _over_time(run: Run, rows: dict[str, np.ndarray], names: list[str]) -> Figur
 
 
 def deflection(run: Run, twin: Run | None) -> Figure:
-    """Deflection of each link: the run, and beside it what the reference trajectory leaves."""
+    """Mid-span deflection of the links from the chord between their ends.
+
+    Dotted: the end of the reference trajectory; right: from there on, in the scale of the residual;
+    grey: residual window.
+    """
     assert run.result.record is not None
     time, end = 1e3 * run.result.record.time, 1e3 * float(run.result.command_end)
     start = end + 1e3 * float(run.case.windows.residual_delay)

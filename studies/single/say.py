@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from studies.engine.poles import HEADER, difference, pole_rows
 from studies.engine.runs import Run
 from studies.show import units
 from studies.show.listing import Rows
-from studies.show.report import Chapter, Drawing, Report, chapter, machine
+from studies.show.report import Chapter, Report, chapter, drawing, machine
 from studies.show.units import headed, number
 from studies.show.words import control_text, motion_text
 from studies.single import plots
@@ -206,14 +205,7 @@ def _links(run: Run, twin: Run | None) -> Chapter | None:
         f"""Largest strain of the ceramics, at the centres of the pairs:
         {1e6 * run.result.metrics.patch_strain_peak.max():.4g} µm/m of
         {1e6 * run.study.patches.strain_limit:.4g} µm/m tolerated.""",
-        run.result.record
-        and Drawing(
-            "deflection",
-            f"""Mid-span deflection of the links from the chord between their ends. Dotted: the end
-            of the reference trajectory at {number(run.result.command_end, "s")} ms; right: from
-            there on, in the scale of the residual; grey: residual window""",
-            partial(plots.deflection, run, twin),
-        ),
+        run.result.record and drawing(plots.deflection, run, twin),
     )
 
 
@@ -264,13 +256,12 @@ def _platform(run: Run) -> Chapter | None:
         {metrics.peak_compression.max():.4g} N (a bare link buckles at {buckling.min():.4g}
         N{first if buckling.max() > 1.001 * buckling.min() else ""}).""",
         Rows(heads, rows),
-        Drawing("error", "Pose minus reference trajectory", partial(plots.pose_error, run)),
+        drawing(plots.pose_error, run, name="error"),
     )
 
 
 def _loop(run: Run) -> Chapter | None:
     metrics, poles = run.result.metrics, run.poles
-    caption = "Actuator voltages, numbered from the actuated joint outwards"
     return chapter(
         "Control loop",
         f"""Samples with an actuator at its limit: {100 * metrics.saturated_fraction:.3g} %; with a
@@ -281,7 +272,7 @@ def _loop(run: Run) -> Chapter | None:
         and f"""Poles: decay and frequency specified, of the nominal link's loop and of the
         assembled machine's. {difference(poles)}""",
         poles and Rows(HEADER, pole_rows(poles)),
-        run.result.record and Drawing("voltage", caption, partial(plots.voltage, run)),
+        run.result.record and drawing(plots.voltage, run),
     )
 
 

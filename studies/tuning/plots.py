@@ -18,9 +18,9 @@ OBJECTIVE = "objective (baseline: 1)"
 
 
 def descent(spec: TuneSpec, findings: TuneFindings) -> Figure:
-    """Best objective that keeps the limits, over iterations, by family; thin: every start.
+    """Best objective within the limits over iterations, machines of the tuning.
 
-    Curves begin where a starting point first keeps the limits.
+    Thin: each starting point, from the iteration on that first keeps the limits.
     """
     figure, ax = figures.one_panel(3.6)
     best = findings.at.least_so_far()
@@ -43,7 +43,7 @@ def descent(spec: TuneSpec, findings: TuneFindings) -> Figure:
 
 
 def gains(spec: TuneSpec, findings: TuneFindings) -> Figure:
-    """What each family gains on fresh machines, one panel for each move."""
+    """Objective on each fresh machine, by move; line at 1: the baseline."""
     rows = len(spec.families)
     figure = Figure(figsize=(figures.WIDTH, 1.5 + 0.3 * rows), layout="constrained")
     axes = figure.subplots(1, len(spec.moves), squeeze=False, sharex=True, sharey=True)[0]
@@ -64,7 +64,7 @@ def gains(spec: TuneSpec, findings: TuneFindings) -> Figure:
 
 
 def front(spec: TuneSpec, findings: TuneFindings, limit: str) -> Figure:
-    """Objective over a limited metric: random designs, the tuned ones, the study.
+    """Objective over a limited metric: random designs, if there are any, tuned ones, the baseline.
 
     Args:
         spec: of the tuning.

@@ -15,7 +15,7 @@ from jaxmodel.metrics import METRICS
 from studies.engine.fidelity import rank_correlation
 from studies.engine.poles import HEADER, difference, pole_rows
 from studies.show.listing import Rows
-from studies.show.report import Chapter, Drawing, Part, Report, chapter
+from studies.show.report import Chapter, Drawing, Part, Report, chapter, drawing
 from studies.show.sketch import CAPTION, sketch
 from studies.show.units import count_text, headed, is_cut_off, number, readable, settling_text
 from studies.study.entries import links_text, parse_entries
@@ -268,13 +268,8 @@ def _own_machine(findings: TuneFindings) -> Chapter | None:
         {links_text(spec.counted_links, spec.study.n_links)}{controlled} the largest value counts.
         The linearised loop has {max(MARGIN_MODES, spec.study.link.modes)} plant modes.""",
         Rows(["design", "file", "objective", *heads, "status"], rows),
-        Drawing(
-            "descent",
-            "Best objective within the limits over iterations, machines of the tuning; thin: each "
-            "starting point, from the iteration on that first keeps the limits"
-            + (f" ({never} never do)" if never else ""),
-            partial(plots.descent, spec, findings),
-        ),
+        drawing(plots.descent, spec, findings),
+        f"{count_text(never, 'starting point')} never kept the limits." if never else None,
     )
 
 
@@ -317,11 +312,7 @@ def _changes(findings: TuneFindings) -> Chapter | None:
         "Change relative to the baseline",
         "Of the mean over the fresh machines.",
         Rows(["design", "move", "objective", *baseline.metrics], rows),
-        Drawing(
-            "gains",
-            "Objective on each fresh machine, by move; line at 1: the baseline",
-            partial(plots.gains, spec, findings),
-        ),
+        drawing(plots.gains, spec, findings),
     )
 
 
@@ -354,9 +345,7 @@ def _limits(findings: TuneFindings) -> Chapter | None:
     front = None
     if spec.metric_limits:
         along = spec.tune.pareto.get("limit", spec.metric_limits[0])
-        random = "random designs, " if findings.searched is not None else ""
-        caption = f"Objective over {along}: {random}tuned ones, the baseline"
-        front = Drawing("front", caption, partial(plots.front, spec, findings, along))
+        front = drawing(plots.front, spec, findings, along)
     return chapter(
         "Limits on the scenarios of the tuning",
         f"Those of the loop: on {where}." if spec.loop_limits else None,
