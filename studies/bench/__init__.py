@@ -4,5 +4,4 @@ In: a kind of work. Out: figures by name. `run` is the one call for everything.
 
 - `works`: runs and sweeps of this program.
 - `gradients`: derivatives of such runs.
-- `peers`: one of the runs with other solvers, with `reference.py` (plain equations) and `w0.c`.
 """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Annotated, Any
 
 import typer
@@ -10,7 +9,6 @@ from rich.console import Console
 from rich.table import Table
 
 from studies.config import start
-from studies.errors import StudyError
 from studies.options import Precision
 from studies.results.document import AsJson, print_document
 
@@ -20,7 +18,6 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
     @app.command()
     def bench(
-        what: Annotated[str, typer.Argument(help="runs, or peers: W0 with other solvers")] = "runs",
         work: Annotated[str, typer.Option(help="W0, W1, W8, grad or sweep; default: W1")] = "",
         executor: Annotated[
             str, typer.Option(help="kernel, scan or gpu; default: the fastest")
@@ -33,29 +30,14 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         as_json: AsJson = False,
     ) -> None:
         """Measure speed and memory on this machine."""
-        if what == "peers" and precision != "float64":
-            raise StudyError(
-                f"--precision {precision}: not allowed with peers, which run W0 in double "
-                "precision; leave it out"
-            )
         start(precision, gpu=True)
         from studies.bench.run import run_bench
 
-        found = run_bench(what, work, executor, batch, cases)
+        found = run_bench(work, executor, batch, cases)
         if as_json:
             print_document(found)
-        elif found.peers:
-            console.print(_peers(found.peers))
         else:
-            console.print(_figures(found.figures or {}))
-
-
-def _peers(rows: Iterable[Any]) -> Table:
-    table = Table("W0 with", "configurations/s", "error [share of the largest rms]", "times slower")
-    for row in rows:
-        numbers = f"{row.configs_per_s:.3g}", f"{row.error:.1e}", f"{row.times_slower:.3g}"
-        table.add_row(row.peer, *numbers)
-    return table
+            console.print(_figures(found.figures))
 
 
 def _figures(figures: dict[str, Any]) -> Table:

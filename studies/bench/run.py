@@ -7,9 +7,8 @@ from typing import Any
 from rich.console import Console
 
 from studies.bench.gradients import bench_gradients
-from studies.bench.peers import PeerRow, bench_peers
 from studies.bench.works import bench_runs, bench_sweep
-from studies.errors import StudyError, field_error
+from studies.errors import StudyError
 from studies.kernels.cpu import full_effort
 from studies.results.labelled import Labelled, told
 
@@ -17,15 +16,13 @@ from studies.results.labelled import Labelled, told
 SWEEP_CASES = 100_000
 
 
-class Benchmark(Labelled, command="bench", version=2):
+class Benchmark(Labelled, command="bench", version=3):
     """What `studies bench --json` prints: speed and memory on this machine."""
 
-    figures: dict[str, Any] | None = told("by name, with its unit; null for peers", default=None)
-    peers: tuple[PeerRow, ...] = told("W0 with each solver; of `studies bench peers`", default=())
+    figures: dict[str, Any] = told("by name, with its unit")
 
 
 def run_bench(
-    what: str = "runs",
     work: str = "",
     executor: str = "",
     batch: int = 0,
@@ -35,39 +32,28 @@ def run_bench(
     """Measure speed and memory on this machine.
 
     Args:
-        what: "runs" of this program, or "peers": W0 with other solvers.
         work: W0, W1, W8, grad or sweep; "": W1.
         executor: kernel, scan or gpu; "": the fastest.
         batch: cases per chunk; 0: automatic.
         cases: of the work `sweep`; 0: `SWEEP_CASES`.
         console: where progress goes; default: standard error.
 
-    Returns:
-        figures by name, or peers.
-
     Raises:
         StudyError: an unknown option, or one that has no effect.
     """
-    if what not in ("runs", "peers"):
-        raise field_error("bench", what, "'runs' or 'peers'")
-    _check(what, work, executor, batch, cases)
+    _check(work, executor, batch, cases)
     console = console or Console(stderr=True, highlight=False, markup=False)
     if work == "sweep":
         return Benchmark(bench_sweep(cases or SWEEP_CASES, console))
     with full_effort():
-        if what == "peers":
-            return Benchmark(peers=tuple(bench_peers(console.print)))
         if work == "grad":
             return Benchmark(bench_gradients(executor, batch))
         return Benchmark(bench_runs(work or "W1", executor, batch))
 
 
-def _check(what: str, work: str, executor: str, batch: int, cases: int) -> None:
+def _check(work: str, executor: str, batch: int, cases: int) -> None:
     """Reject options that have no effect."""
-    if what == "peers":
-        options = {"--work": work, "--executor": executor, "--batch": batch, "--cases": cases}
-        reason = "with peers, which do W0 in double precision"
-    elif work == "sweep":
+    if work == "sweep":
         options, reason = {"--executor": executor, "--batch": batch}, "with --work sweep"
     else:
         options, reason = {"--cases": cases}, "but with --work sweep"

@@ -32,7 +32,6 @@ OF_ONE_MACHINE = (
     "jaxmodel/mechanisms/",
     "studies/atlas/",
     "studies/papers/",
-    "studies/bench/peers.py",
     "studies/reference/slider_crank.py",
 )
 #: Threes and sixes that count something else: coefficients, stages of a step, entries of a message.

@@ -523,10 +523,7 @@ def test_command_fails_a_design(capsys, tmp_path):
     assert code == 1 and "failed by mode" in text and "unstable" in text
     assert "no fast move: not today" in text
     report = text_of((out / "report.html").read_text(encoding="utf-8"))
-    assert (
-        "**Failed by mode" in report
-        and "## The fast move" not in report
-    )
+    assert "**Failed by mode" in report and "## The fast move" not in report
     assert "| no |" in report and "- No fast move: not today" in report
     data = json.loads((out / "certificate.json").read_text())
     jsonschema.validate(data, schema("spillover"))

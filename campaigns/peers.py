@@ -1,4 +1,4 @@
-"""W0 with other solvers, in one table: how this program's speed compares.
+"""`python -m campaigns.peers`: W0 with other solvers, how this program's speed compares.
 
 All of them integrate the same cases: the drive's reference at start, middle and end of each sample,
 voltages from modal velocities, rms deflection in the residual window. Their accuracy is measured
@@ -33,9 +33,9 @@ from studies import config
 from studies.bench.works import build_work, make_layout, timed
 from studies.engine.executor import Executor
 from studies.engine.plan import Layout
+from studies.kernels.cpu import full_effort
 from studies.kernels.llvm import is_available
 from studies.reference import lagrangian as reference
-from studies.results.labelled import Labelled, labelled, told
 from studies.study.cases import as_arrays
 from studies.study.spec import paper_study
 
@@ -68,13 +68,13 @@ class Work(NamedTuple):
         return as_arrays(jax.tree.unflatten(jax.tree.structure(self.cases), [x[:n] for x in wide]))
 
 
-class PeerRow(Labelled):
+class PeerRow(NamedTuple):
     """Measurements of a peer."""
 
-    peer: str = told("solver")
-    configs_per_s: float = labelled("1/s", "configurations")
-    error: float = labelled("1", "largest one of a residual rms, over the largest residual rms")
-    times_slower: float = labelled("1", "than the fastest peer")
+    peer: str
+    configs_per_s: float  # [1/s]
+    error: float  # largest one of a residual rms, over the largest residual rms [1]
+    times_slower: float  # than the fastest peer
 
 
 class Peer(NamedTuple):
@@ -432,3 +432,13 @@ def _compile(compiler: str, width: int) -> Any:
     function.argtypes = [address, ctypes.c_long, ctypes.c_double, *[address] * 5]
     function.restype = None
     return function
+
+
+if __name__ == "__main__":
+    config.configure()
+    with full_effort():
+        for row in bench_peers(print):
+            print(
+                f"{row.peer}: {row.configs_per_s:.3g} configurations/s, error {row.error:.1e}, "
+                f"{row.times_slower:.3g} times slower"
+            )
