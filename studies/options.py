@@ -23,6 +23,12 @@ Resume: TypeAlias = Annotated[
 ]
 Quiet: TypeAlias = Annotated[bool, typer.Option("--quiet", help="print no progress")]
 Pdf: TypeAlias = Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")]
+HasReport: TypeAlias = Annotated[
+    bool, typer.Option("--report", help="also write a report with figures, HTML")
+]
+Explore: TypeAlias = Annotated[
+    bool, typer.Option("--explore", help="also write explorer.html, to look at everything")
+]
 Precision: TypeAlias = Annotated[str, typer.Option(help="float64 or float32")]
 #: Of the commands that look for the smallest change that breaks a design.
 Tolerance: TypeAlias = Annotated[

@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 
 from studies.config import start
-from studies.options import Case, Out, Pdf, Quiet, Resume
+from studies.options import Case, Explore, Out, Pdf, Quiet, Resume
 from studies.publish import REPORT, announce
 
 
@@ -29,9 +29,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         case: Case = None,
         resume: Resume = False,
         pdf: Pdf = False,
-        explore: Annotated[
-            bool, typer.Option("--explore", help="also write explorer.html, to look at all runs")
-        ] = False,
+        explore: Explore = False,
         quiet: Quiet = False,
     ) -> None:
         """Map all subsets of controlled links and modes, workspace modes and platform error."""

@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from studies.config import start
-from studies.options import Out, Pdf
+from studies.options import Explore, Out, Pdf
 
 
 def add_commands(app: typer.Typer, console: Console) -> None:
@@ -22,12 +22,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         ],
         out: Out,
         pdf: Pdf = False,
-        explore: Annotated[
-            bool,
-            typer.Option(
-                "--explore", help="also write explorer.html, to look at the possible machines"
-            ),
-        ] = False,
+        explore: Explore = False,
     ) -> None:
         """Fit parameters of a study to measurements, and say how well they are known."""
         from studies.publish import check_folder

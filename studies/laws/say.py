@@ -101,14 +101,11 @@ def _method(findings: LawFindings) -> Chapter | None:
     times = ", ".join(f"{share:.3g}" for share in MOVES)
     return chapter(
         "How they were compared",
-        f"""Each law was tuned on the design's drive, by loop gain, the law's parameters and those
-        of the shared settings that it depends on; each drive with the design's law, by its gains
-        and parameters. Combinations were not tuned again. The objective is the residual vibration
-        of the controlled links in the design's own motion, for drives also the platform's largest
-        error while moving, within the limits, on {count_text(budget.machines, "machine")}:
-        {count_text(budget.starts, "starting point")} and
-        {count_text(budget.iterations, "iteration")} for each. Those that cannot keep the limits are
-        listed, but not ranked.""",
+        f"""Each law was tuned on the design's drive, each drive with the design's law, for residual
+        vibration (drives also for the platform's error while moving) within the limits, on
+        {count_text(budget.machines, "machine")}: {count_text(budget.starts, "starting point")} and
+        {count_text(budget.iterations, "iteration")} for each. Combinations were not tuned again.
+        Those that cannot keep the limits are listed, but not ranked.""",
         f"""All were then judged on {count_text(machines, "machine")} that none had been tuned on
         ({", ".join(spread)}, link by link where it is a link's), each in
         {count_text(moves, "move")} of {times} times the design's move time, each machine with its

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Column, Table
 
 from studies import config
 from studies.engine.batches import ProgressCallback
@@ -16,7 +15,7 @@ from studies.papers.card import CardResult, PaperCard, PaperOutcome
 from studies.papers.catalogue import find_card
 from studies.publish import REPORT, announce, check_folder, publish
 from studies.results.document import json_text
-from studies.show.listing import Rows
+from studies.show.listing import Rows, print_rows
 from studies.show.pages import write_report
 from studies.store import write_store
 
@@ -97,9 +96,7 @@ def _document(card: PaperCard, result: CardResult) -> PaperOutcome:
 
 
 def _print_outcome(result: CardResult, out: Path, console: Console) -> None:
-    table = Table("claim", Column("outcome", overflow="fold"), "found")
-    for one in result.verdicts:
-        table.add_row(one.claim.text, one.outcome, one.found)
-    console.print(table)
+    rows = [[one.claim.text, one.outcome, one.found] for one in result.verdicts]
+    print_rows(Rows(["claim", "outcome", "found"], rows), console)
     data = [f"{name}.h5" for name in result.stores] + [f"{name}.csv" for name in result.tables]
     announce(console, out / REPORT, f"; data: {', '.join([*data, CLAIMS])} in the same folder")

@@ -120,8 +120,10 @@ def print_result(report: Report, console: Console) -> None:
 
 
 def print_report(report: Report, console: Console) -> None:
-    """Print the tables, and then the result."""
-    for part in report.parts:
+    """Print the result, and the texts and tables below it."""
+    print_result(report, console)
+    for part in [*report.parts, report.caveat]:
         if isinstance(part, Rows):
             print_rows(part, console)
-    print_result(report, console)
+        elif isinstance(part, str) and part:
+            console.print(" ".join(part.replace("`", "").split()), soft_wrap=True)

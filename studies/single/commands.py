@@ -4,24 +4,16 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Console
 
 from studies.config import start
 from studies.errors import field_error
-from studies.options import Design, Precision
+from studies.options import Case, Design, HasReport, Precision
 from studies.publish import announce
 from studies.results.document import AsJson, print_document
-
-if TYPE_CHECKING:
-    from studies.show.report import Report
-
-_Report = Annotated[
-    bool,
-    typer.Option("--report", help="also write a report with figures, as HTML"),
-]
 
 
 def add_commands(app: typer.Typer, console: Console) -> None:
@@ -31,7 +23,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     def simulate(
         study: Annotated[Path, typer.Argument(help="study file (TOML) or ready-made design")],
         out: Annotated[Path | None, typer.Option(help="HDF5 file for the trajectories")] = None,
-        report: _Report = False,
+        report: HasReport = False,
         margins: Annotated[
             bool, typer.Option("--margins", help="also disk, phase and delay margin of the loop")
         ] = False,
@@ -41,6 +33,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         """Run one study and print its metrics; with --out, also save full trajectories."""
         start(precision)
         from studies.engine.runs import uncontrolled_twin
+        from studies.show.report import print_report
         from studies.single.run import simulate as simulate_study
         from studies.single.say import say
 
@@ -50,7 +43,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
             print_document(run_document(run, uncontrolled_twin(run)))
         else:
-            _print_report(say(run, uncontrolled_twin(run)), console)
+            print_report(say(run, uncontrolled_twin(run)), console)
             _print_files(out, report, console)
         if run.status:
             sys.exit(1)
@@ -58,11 +51,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     @app.command()
     def replay(
         design: Design,
-        case: Annotated[
-            str | None, typer.Option(help="case number, or id: and digits of the case's id")
-        ] = None,
+        case: Case = None,
         out: Annotated[Path | None, typer.Option(help="HDF5 file for the trajectories")] = None,
-        report: _Report = False,
+        report: HasReport = False,
     ) -> None:
         """Rerun one case of a sweep with full trajectories; compare with the sweep's results."""
         start()
@@ -107,6 +98,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         """Natural frequencies and damping ratios of the assembled machine."""
         start()
         from studies.engine.modes import machine_modes
+        from studies.show.report import print_report
         from studies.single.modes import say
         from studies.study.spec import load_study
 
@@ -127,15 +119,13 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             console.print(
                 "the paper's machine without damping; with it: studies modes paper", soft_wrap=True
             )
-        _print_report(say(result), console)
+        print_report(say(result), console)
 
     @app.command()
     def plant(
         design: Design,
         out: Annotated[Path, typer.Option(help="NPZ, MAT or JSON file")],
-        case: Annotated[
-            str | None, typer.Option(help="case number, or id: and digits of the case's id")
-        ] = None,
+        case: Case = None,
     ) -> None:
         """Write the sampled linear plant of a design, for a controller designed elsewhere."""
         start()
@@ -157,19 +147,6 @@ def _numbers(option: str, written: str) -> tuple[float, ...]:
         return tuple(map(float, written.split(",")))
     except ValueError:
         raise field_error(option, written, "numbers with commas between them") from None
-
-
-def _print_report(report: Report, console: Console) -> None:
-    """Print the result, and the texts and tables below it."""
-    from studies.show.listing import Rows, print_rows
-    from studies.show.report import print_result
-
-    print_result(report, console)
-    for part in [*report.parts, report.caveat]:
-        if isinstance(part, Rows):
-            print_rows(part, console)
-        elif isinstance(part, str) and part:
-            console.print(" ".join(part.replace("`", "").split()), soft_wrap=True)
 
 
 def _print_files(out: Path | None, has_report: bool, console: Console) -> None:

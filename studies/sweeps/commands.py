@@ -20,7 +20,16 @@ from studies.cluster.connect import (
 )
 from studies.config import start
 from studies.errors import StudyError
-from studies.options import MaybeOut, Precision, Quiet, Resume, SweepFile, Tolerance
+from studies.options import (
+    Explore,
+    HasReport,
+    MaybeOut,
+    Precision,
+    Quiet,
+    Resume,
+    SweepFile,
+    Tolerance,
+)
 from studies.publish import EXPLORER, REPORT, announce
 from studies.results.document import AsJson, print_document
 
@@ -54,10 +63,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             bool, typer.Option("--dry-run", help="show what would run, and how long it would take")
         ] = False,
         quiet: Quiet = False,
-        report: Annotated[bool, typer.Option("--report", help="also write report.html")] = False,
-        explore: Annotated[
-            bool, typer.Option("--explore", help="also write explorer.html, to look at all cases")
-        ] = False,
+        report: HasReport = False,
+        explore: Explore = False,
         precision: Precision = "float64",
         scheduler: Scheduler = None,
         local_workers: LocalWorkers = None,

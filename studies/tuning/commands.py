@@ -18,7 +18,7 @@ from studies.cluster.connect import (
 )
 from studies.config import start
 from studies.errors import StudyError
-from studies.options import MaybeOut, Quiet, Resume
+from studies.options import Explore, MaybeOut, Quiet, Resume
 
 if TYPE_CHECKING:
     from studies.tuning.spec import TuneSpec
@@ -37,12 +37,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         audit: Annotated[
             bool, typer.Option("--audit", help="only check derivatives against finite differences")
         ] = False,
-        explore: Annotated[
-            bool,
-            typer.Option(
-                "--explore", help="also write explorer.html, to look at all starting points"
-            ),
-        ] = False,
+        explore: Explore = False,
         quiet: Quiet = False,
         scheduler: Scheduler = None,
         local_workers: LocalWorkers = None,

@@ -13,7 +13,7 @@ from studies.show.report import Report, chapter, drawing
 from studies.show.words import control_text, motion_text
 from studies.study.margin import margin_text
 from studies.study.spec import Study
-from studies.twin.compare import BothModels, ChangedRun, Gap, deflection, gap, place, turn, voltage
+from studies.twin.compare import ChangedRun, Gap, deflection, gap, place, turn, voltage
 from studies.twin.margin import GrowthMargin
 from studies.twin.plots import side_by_side
 from studies.twin.result import FIGURE, TwinResult
@@ -69,7 +69,8 @@ def compared(result: TwinResult) -> list[ComparedQuantity]:
     ) -> None:
         for is_controlled, both in ((False, result.runs.free), (True, result.runs.controlled)):
             if name != "voltage" or is_controlled:
-                own.append(_compared(name, unit, is_controlled, both, quantity, entries, result))
+                apart = gap(both, quantity, result.window)
+                own.append(ComparedQuantity(name, unit, is_controlled, apart, entries))
 
     add("mid-span deflection", "m", deflection, links)
     add("voltage", "V", voltage, links)
@@ -77,24 +78,6 @@ def compared(result: TwinResult) -> list[ComparedQuantity]:
     if n_pose == 3:
         add("platform, error of angle", "rad", turn, ("phi",))
     return own
-
-
-def _compared(
-    name: str,
-    unit: str,
-    is_controlled: bool,
-    both: BothModels,
-    quantity: Callable[[Any], np.ndarray],
-    entries: tuple[str, ...],
-    result: TwinResult,
-) -> ComparedQuantity:
-    return ComparedQuantity(
-        name=name,
-        unit=unit,
-        is_controlled=is_controlled,
-        gap=gap(both, quantity, result.window),
-        entries=entries,
-    )
 
 
 def gap_rows(result: TwinResult) -> list[list[str]]:
@@ -229,12 +212,10 @@ def say(result: TwinResult) -> Report:
             chapter(
                 "The twin",
                 f"""{result.version}: each link consists of {result.settings.n_elements} elements or
-                more (ANCF cables: large rotations, bending, stretch), with nodes at the ends of
-                patches and at mid-span. Patches are pairs of moments, sensors differences of slope.
-                Structural damping has the study's ratios in every mode of a link between pinned
-                ends. Steps of {1e6 * step:.3g} µs, half of that for poles and margin, generalised
-                alpha. The analogue filters are stepped exactly, the controller is the C code of
-                `studies export --target c`, called once per sample.""",
+                more (ANCF cables). Patches are pairs of moments, sensors differences of slope.
+                Steps of {1e6 * step:.3g} µs, half of that for poles and margin, generalised alpha.
+                The analogue filters are stepped exactly, the controller is the C code of `studies
+                export --target c`.""",
             ),
         ],
         files={"Study file": study},

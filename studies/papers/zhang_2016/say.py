@@ -158,9 +158,7 @@ def _table_1(machines: Machines) -> Chapter | None:
         rounding of the converter counts. On the nominal machine a controlled link changes by
         {span(nominal["controlled"], "+.1f")} %, an uncontrolled one by
         {span(nominal["uncontrolled"], "+.1f")} %. A well damped mode has no peak left: its
-        reduction is at least this much. The paper's own columns are not like for like: the peak of
-        link 2 falls more with two links controlled (43.23 %) than with three (42.92 %), contrary to
-        the statement that more controlled links do better.""",
+        reduction is at least this much.""",
         *_beside(machines, "fig13", "fig14", "fig15", "fig16", "fig17", "fig18"),
     )
 
@@ -183,11 +181,9 @@ def _ratios(machines: Machines) -> Chapter | None:
         "Gain ratios of efficient modal control: (26) and (27)",
         "Ours by (24) from the time mean of E = ω²q² + q'² while moving, without control.",
         Rows(list(COLUMNS), ratio_rows(machines)),
-        f"""The ratios show what excites the links: a smooth move bends them quasi-statically, and
-        the energy in mode j falls with a high power of its frequency. The paper's may be of another
-        quantity than energy: the root of {largest:.2g} is {largest**0.5:.2g}. The controller's
-        coordinates matter too: pinned-free modes, as the paper's, are not decoupled on the
-        assembled machine, so that mode 1's motion appears in its modes 2 and 3.""",
+        f"""The ratios show what excites the links. The paper's may be of another quantity than
+        energy: the root of {largest:.2g} is {largest**0.5:.2g}. Pinned-free modes, as the paper's,
+        are not decoupled on the assembled machine: mode 1's motion appears in modes 2 and 3.""",
         *_beside(machines, "fig04"),
     )
 
@@ -205,9 +201,7 @@ def _platform(machines: Machines) -> Chapter | None:
         from {_delays(machines)} ms after it on; `fig06`, `fig08` and `fig10` show the error from
         {view} ms after it.""",
         Rows(list(COLUMNS), platform_rows(machines)),
-        f"""Directions in which control of two links more than halves the error: {halved}. Where an
-        error grows, the links' forces on the platform cancelled in part without control, and
-        damping only some of them ended this balance.""",
+        f"Directions in which control of two links more than halves the error: {halved}.",
         *_beside(machines, "fig05", "fig06", "fig08", "fig10"),
     )
 
@@ -229,9 +223,8 @@ def _designs(nominal: Context) -> Chapter | None:
     return chapter(
         "Nominal machine: other designs, three links, three modes, fast move without shaper",
         Rows([*heads, "residual rms [µm]", "peak voltage [V]"], design_rows(nominal)),
-        """The factor multiplies the machine's gains, half of the paper's. Margin, radius and
-        damping are those of the linearised sampled loop at home. A loop that is unstable there
-        counts as unstable even where saturation keeps the run bounded.""",
+        """The factor multiplies the machine's gains, half of the paper's. A loop that is unstable
+        at home counts as unstable even where saturation keeps the run bounded.""",
     )
 
 
