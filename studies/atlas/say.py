@@ -218,18 +218,15 @@ def _signs(findings: AtlasFindings) -> Chapter | None:
     deeper = ""
     if np.all(ours[:, on] < paper[on]):
         deeper = ", all of them more than in the paper, since the gains add more damping here"
-    heads = ["setting", "controlled: peaks that fall", "by [%]"]
-    heads.append("uncontrolled: same sign as the paper")
+    heads = ["setting", "controlled: peaks that fall", "by [%]", "uncontrolled: same sign"]
     heads.append("link 3 with 1 and 2 controlled, links 2 and 3 with 1 controlled [%]")
+    rows = [["paper", *cells(paper, "")], *_by_setting(findings, map(cells, ours, agreeing))]
     return chapter(
         "The paper's Table 1: signs",
         f"""Change of the spectral peak of mode 1 relative to no control: all three links with
         {"two modes" if findings.choices.modes > 1 else "mode 1"} each, links 1 and 2 with mode 1,
         link 1 with mode 1.""",
-        Rows(
-            heads,
-            [["paper", *cells(paper, "")], *_by_setting(findings, map(cells, ours, agreeing))],
-        ),
+        Rows(heads, rows),
         f"""It {_verdict(fallen, ours[:, on].size)} for controlled links: {fallen} of
         {ours[:, on].size} fall{deeper}. Uncontrolled links: signs agree in {agree.sum()} of
         {agree.size} cases, with changes of up to {np.abs(ours[:, ~on]).max():.0f} % here and

@@ -9,7 +9,7 @@ import numpy as np
 
 from studies.commission.spec import MeasuredSpec
 from studies.engine.fast_motion import LEAST_STEPS
-from studies.fitting.spec import number_unit
+from studies.fitting.spec import shown_unit
 from studies.publish import shown
 from studies.results.labelled import Labelled, derived, told, unwritten
 from studies.study.margin import margin_text
@@ -66,8 +66,8 @@ def found_text(outcome: CommissionFindings) -> str:
 
 
 def _number_text(x: dict[str, Any]) -> str:
-    text = f"{x['name']} {x['value']:.5g} +- {x['sigma']:.2g} {number_unit(x['name'])}"
-    return text.removesuffix(" 1")
+    factor, unit = shown_unit(x["name"])
+    return f"{x['name']} {factor * x['value']:.5g} +- {factor * x['sigma']:.2g} {unit}".rstrip()
 
 
 def chosen_text(outcome: CommissionFindings) -> str:

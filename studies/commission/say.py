@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from studies.commission.findings import CommissionFindings
 from studies.commission.stages import STAGES
-from studies.fitting.spec import number_unit
+from studies.fitting.spec import shown_unit
 from studies.show.listing import Rows
 from studies.show.report import Items, Report, chapter, machine
 from studies.study.margin import margin_text
@@ -17,6 +19,7 @@ def say(outcome: CommissionFindings) -> Report:
     measured = outcome.measured
     study = outcome.tuned or measured.study
     pages = [f"{stage.name}/{stage.page}" for stage in STAGES]
+    numbers = list(map(_number_row, outcome.numbers))
     margins = [] if outcome.margins is None else [outcome.margins]
     return Report(
         title=f"{outcome.title or 'untitled study'}: "
@@ -30,10 +33,7 @@ def say(outcome: CommissionFindings) -> Report:
         `docs/reference/export.md` says, then begin with a small gain.""",
         top=[machine(study)],
         chapters=[
-            chapter(
-                "What was found",
-                Rows(["parameter", "unit", "value", "95 %"], _number_rows(outcome)),
-            ),
+            chapter("What was found", Rows(["parameter", "unit", "value", "95 %"], numbers)),
             chapter(
                 "How robust it is",
                 f"""Gain margin of the chosen controller, as fixed numbers, on the machines that the
@@ -53,14 +53,11 @@ def say(outcome: CommissionFindings) -> Report:
     )
 
 
-def _number_rows(outcome: CommissionFindings) -> list[list[str]]:
-    """Row of each fitted number."""
-    rows = []
-    for x in outcome.numbers:
-        low, high = x["interval_95"]
-        span = f"{low:.5g} to {high:.5g}"
-        rows.append([x["name"], number_unit(x["name"]), f"{x['value']:.5g}", span])
-    return rows
+def _number_row(x: dict[str, Any]) -> list[str]:
+    """Row of a fitted number."""
+    factor, unit = shown_unit(x["name"])
+    value, low, high = (f"{factor * y:.5g}" for y in (x["value"], *x["interval_95"]))
+    return [x["name"], unit, value, f"{low} to {high}"]
 
 
 def _quantiles(margins: np.ndarray) -> list[str]:

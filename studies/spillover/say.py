@@ -141,6 +141,7 @@ def _margins(certificate: Certificate, plants: int) -> Chapter | None:
     heads += ["smallest damping ratio", "least damped", "passes"]
     good = int(certificate.passes[certificate.exists].sum())
     left_out = int((~certificate.exists).sum())
+    free = certificate.free_damping_ratio
     return chapter(
         "Margins and damping",
         f"""The controller (law {control.law}, basis {control.basis}, {certificate.n_controlled}
@@ -159,8 +160,8 @@ def _margins(certificate: Certificate, plants: int) -> Chapter | None:
             else ""
         ),
         f"""Gain margin, what becomes unstable beyond it, and smallest damping ratio of plants with
-        {sizes[-1]} modes per link (without control: {_free_damping(certificate)}). The modes named
-        hold most of the energy of the motion; those above half the sample rate,
+        {sizes[-1]} modes per link (without control: {span(free[np.isfinite(free)])}). The modes
+        named hold most of the energy of the motion; those above half the sample rate,
         {electronics.sample_rate_hz / 2:g} Hz, reach the controller folded.""",
         Rows(heads, _plant_rows(certificate)),
         drawing(plots.margins, certificate, height=4.35),
@@ -264,13 +265,6 @@ def _coverage(certificate: Certificate) -> Chapter | None:
         of the converters. The smallest change is the nearest one that a search found.""",
         Items(certificate.notes),
     )
-
-
-def _free_damping(certificate: Certificate) -> str:
-    """Least and largest damping ratio without control [1], or one if they hardly differ."""
-    free = certificate.free_damping_ratio
-    low, high = float(np.nanmin(free)), float(np.nanmax(free))
-    return span([low] if high - low < 0.1 * high else [low, high])
 
 
 def _plant_rows(certificate: Certificate) -> list[list[str]]:

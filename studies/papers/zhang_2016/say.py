@@ -90,12 +90,10 @@ def _result(machines: Machines) -> list[str]:
     smooth = 1e6 * context.measures.residual[context.find("paper", "ei", 3, OFF)].max()
     is_halved = any(len(_halved_directions(one)) == 3 for one in machines)
     half = "" if is_halved else "; and that two links more than halve the platform's error"
-    left = f"{nominal['residual'][1]:.2g} µm"
-    if nominal["residual"][1] < step:
-        left = f"less than one ADC step ({step:.2g} µm)"
-    own = f"{smooth:.2g} µm"
-    if smooth < step:
-        own = "less than one ADC step even without control"
+
+    def seen(rms: float) -> str:
+        return f"{rms:.2g} µm" if rms >= step else f"less than one ADC step ({step:.2g} µm)"
+
     return [
         f"the measurements of section 5 are reproduced on the machine fitted to them: frequencies "
         f"of {span(fitted['frequency'][0], '.1f')} Hz and {span(fitted['frequency'][1], '.1f')} Hz "
@@ -106,8 +104,8 @@ def _result(machines: Machines) -> list[str]:
         f"not reproduced on either machine: the energy ratios, of which mode 2 has "
         f"{span(fitted['second'], '.2g')} on the fitted one instead of {span(second, 'g')}{half}",
         f"on the nominal machine, half of the paper's gains reduce the vibration after a fast move "
-        f"from {nominal['residual'][0]:.2g} µm rms (worst link) to {left}; the paper's own move "
-        f"with its shaper leaves {own}",
+        f"from {nominal['residual'][0]:.2g} µm rms (worst link) to {seen(nominal['residual'][1])}; "
+        f"the paper's own move with its shaper leaves {seen(smooth)} without control",
     ]
 
 
