@@ -52,6 +52,10 @@ class ActiveChannels(NamedTuple):
         """Samples after which only this share of the start is left, for a pole below 1."""
         return int(np.ceil(np.log(share) / np.log(max(self.slowest_pole, 0.1)))) + 8
 
+    @property
+    def has_direct(self) -> bool:
+        return bool(np.any(self.direct))
+
 
 def acting(link: np.ndarray, is_rival: np.ndarray, energy: np.ndarray) -> np.ndarray:
     """Which channels act: among a link's rivals only those of highest energy, (..., M).

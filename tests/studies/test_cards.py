@@ -1,6 +1,9 @@
 """Results as notebooks show them, and the progress of long commands there."""
 
+import ast
 import io
+from importlib import import_module
+from pathlib import Path
 from types import SimpleNamespace
 
 import IPython.display
@@ -8,7 +11,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from studies.cards import CARDS, SAY
+import studies
+from studies.cards import SAY
 from studies.engine.modes import NamedModes
 from studies.engine.progress import Phases
 from studies.engine.runs import run_study
@@ -55,15 +59,28 @@ def results():
     }
 
 
+def test_all_that_shows_itself_has_something_to_say():
+    sources = Path(studies.__file__).parent.rglob("*.py")
+    classes = [
+        node.name
+        for path in sources
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ClassDef)
+        and any(getattr(x, "name", "") == "_repr_html_" for x in node.body)
+    ]
+    assert sorted(classes) == sorted(SAY)
+    assert all(callable(import_module(module).say) for module in SAY.values())
+
+
 @pytest.mark.parametrize(
     "name", ["Run", "NamedModes", "Certificate", "Exported", "ComparedVariants"]
 )
 def test_a_result_shows_itself(results, name):
     result = results[name]
-    assert type(result).__name__ == name and name in CARDS | SAY
+    assert type(result).__name__ == name and name in SAY
     html = result._repr_html_()
     assert "<script" not in html and html.count("data:image/png;base64,") == 1
-    assert ("&lt;script&gt;" in html) == (name not in ("NamedModes", "Certificate"))  # no title
+    assert ("&lt;script&gt;" in html) == (name != "NamedModes")
     assert len(html) < 1e5
 
 
