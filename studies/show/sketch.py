@@ -31,12 +31,12 @@ SHORTEST_PATH = 0.08
 
 
 def sketch(study: Study) -> Figure:
-    """The machine with its patches, platform and path; links to scale below."""
+    """The machine with its patches, platform and path; beside it links to scale."""
     pose = np.array(study.motion.waypoints[0], float)
     near, joint = standing(study, pose)
-    figure = Figure(figsize=(3.4, 5.2), layout="constrained")
+    figure = Figure(figsize=(figures.WIDTH, 3.0), layout="constrained")
     ax: Axes
-    ax, below = figure.subplots(2, 1, height_ratios=(3.0, 2.2))
+    ax, below = figure.subplots(1, 2, width_ratios=(1.0, 1.3))
     _carriers(ax, study, near)
     ax.fill(*(1e3 * joint.T), color="#DDDDDD", zorder=1)
     for i, (start, end) in enumerate(zip(near, joint, strict=True)):
