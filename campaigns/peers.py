@@ -426,6 +426,7 @@ def _compile(compiler: str, width: int) -> Any:
             ],
             check=True,
             capture_output=True,
+            timeout=120,
         )
         function = ctypes.CDLL(str(library)).run
     address = ctypes.c_void_p

@@ -198,9 +198,9 @@ def _links(run: Run, twin: Run | None) -> Chapter | None:
         f"""Deflections: the largest of the stations at
         {", ".join(f"{100 * x:g}" for x in metrics.stations)} % of the link. Residual window:
         {number(windows.residual_length, "s")} ms, from {number(windows.residual_delay, "s")} ms
-        after the end of the reference trajectory{settled}. Settling time: from that end until the
-        deflection stays within {number(metrics.settling_band, "m")} µm. The run ends
-        {number(_watched(run), "s")} ms after the reference trajectory.{early}""",
+        after the reference trajectory at {number(run.result.command_end, "s")} ms{settled}.
+        Settling time: until a link stays within {number(metrics.settling_band, "m")} µm; the run
+        ends {number(_watched(run), "s")} ms after it.{early}""",
         _link_rows(run, twin),
         f"""Largest strain of the ceramics, at the centres of the pairs:
         {1e6 * run.result.metrics.patch_strain_peak.max():.4g} µm/m of

@@ -17,7 +17,7 @@ from jaxmodel.plant import build_plant
 from studies import cli
 from studies.engine.columns import case_variables
 from studies.engine.preflight import check_run
-from studies.engine.results import SweepData, metric_values, read_sweep
+from studies.engine.results import SweepData, meets, metric_values, read_sweep
 from studies.engine.runs import run_study
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
@@ -34,7 +34,6 @@ from studies.study.template import study_template
 from studies.sweeps.dry_run import axis_rows
 from studies.sweeps.plots import plot
 from studies.sweeps.run import run_sweep
-from studies.sweeps.show import select
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import parse_tuning
 from tests import forms
@@ -175,7 +174,7 @@ def test_entries_of_one_number_for_all_links_are_swept():
     data = SweepData(case_variables(table) | {"status": ok}, {}, spec, table)
     for ask in (
         lambda: metric_values(data, "link.thickness"),
-        lambda: select(data, "link.thickness > 0.0021"),
+        lambda: meets(data, "link.thickness > 0.0021", "--subject-to"),
         lambda: plot(data, "link.thickness", "link.thickness[1]", None),
     ):
         with pytest.raises(StudyError, match=r"differs between links here; name one, such as"):

@@ -456,7 +456,7 @@ def test_every_source_of_a_number_is_in_the_digest(tmp_path):
         path.write_bytes(text + b"\n# changed\n")
         assert sources.digest(*roots, top=tmp_path) != before[roots], name
         path.write_bytes(text)
-    report = tmp_path / "studies" / "sweeps" / "report.py"
+    report = tmp_path / "studies" / "sweeps" / "say.py"
     report.write_bytes(report.read_bytes() + b"\n")
     assert all(sources.digest(*roots, top=tmp_path) == x for roots, x in before.items())
 

@@ -287,7 +287,7 @@ def test_a_run_that_is_not_ok_fails(capsys, monkeypatch, ended, wanted):
     monkeypatch.setattr(single_run, "simulate", lambda *_: made)
     monkeypatch.setattr("studies.engine.runs.uncontrolled_twin", lambda run: None)
     monkeypatch.setattr("studies.single.say.say", lambda *_: None)
-    monkeypatch.setattr("studies.single.commands._print_report", lambda *_: None)
+    monkeypatch.setattr("studies.show.report.print_report", lambda *_: None)
     assert run(capsys, "simulate", "paper")[0] == wanted
 
 

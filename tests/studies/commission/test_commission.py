@@ -235,7 +235,7 @@ def test_all_stages_lead_to_firmware(monkeypatch, tmp_path):
     pretended = Pretended(monkeypatch)
     made, text, page = commissioned(tmp_path / "out")
     assert made.is_good and pretended.calls == ["fit", "tune", "certificate", "firmware"]
-    assert "gain margin 2.5 or more on 2 machines" in text and "link.youngs_modulus 7e+10" in text
+    assert "gain margin 2.5 or more on 2 machines" in text and "link.youngs_modulus 70 +-" in text
     assert "tuned on a fast first move without shaper" in text
     assert re.search(r"gain factor [\d.]+ \(lowered from 0.6\), ", text)
     assert "commissioned" in page and "firmware/verification.html" in page

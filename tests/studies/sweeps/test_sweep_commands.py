@@ -110,7 +110,7 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
     page = parsed((tmp_path / "run.html").read_text(encoding="utf-8"))
     assert (
         len(page.images) == 4
-        and "the sweep has: ok; largest relative difference of a metric" in page.text
+        and "he sweep has: ok; largest relative difference of a metric" in page.text
     )
     _, text, _ = run(capsys, "best", out, "--by", "residual_rms", "--count", "1")
     number, name = re.search(r"(\d+) +│ ([0-9a-f]{8}) ", text).groups()
