@@ -12,12 +12,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from matplotlib.figure import Figure
 from rich.console import Console
 
-from studies.show import figures
 from studies.show.listing import Rows, print_rows
-from studies.show.sketch import CAPTION, sketch
 from studies.study.spec import Study
 
 
@@ -27,7 +24,7 @@ class Drawing:
 
     name: str
     caption: str
-    draw: Callable[[], Figure] | None
+    draw: Callable[[], Any] | None  # Matplotlib, which takes long to import, is not needed here
 
 
 @dataclass(frozen=True)
@@ -89,8 +86,10 @@ def drawing(
         height: [inch] of a figure with one pair of axes.
     """
 
-    def on_axes() -> Figure:
-        figure, axes = figures.one_panel(height)
+    def on_axes() -> Any:
+        from studies.show.figures import one_panel
+
+        figure, axes = one_panel(height)
         draw(*arguments, axes)
         return figure
 
@@ -101,6 +100,8 @@ def drawing(
 
 def machine(study: Study) -> Drawing:
     """The sketch of a study's machine."""
+    from studies.show.sketch import CAPTION, sketch
+
     return Drawing("machine", CAPTION, partial(sketch, study))
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-from matplotlib.figure import Figure
 
 from studies.engine.modes import NamedModes
-from studies.show import figures
 from studies.show.listing import Rows
 from studies.show.report import Report, chapter, drawing
 
@@ -25,8 +25,10 @@ def say(modes: NamedModes) -> Report:
     return Report("Natural modes of the machine", [], "", "", [], [shown], {})
 
 
-def _bars(modes: NamedModes) -> Figure:
+def _bars(modes: NamedModes) -> Any:
     """Energy of the lowest modes, by what holds it."""
+    from studies.show import figures
+
     figure, ax = figures.one_panel(2.0)
     shares = np.array([*modes.link_share.sum(axis=2).T, modes.drive_share])[:, :MOST]
     shares = 100 * np.nan_to_num(shares)
