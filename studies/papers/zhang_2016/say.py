@@ -118,7 +118,7 @@ def _machines(machines: Machines) -> Chapter | None:
     fitted, nominal = machines
     study, steps = nominal.runs.study, [1e6 * x.runs.frame.adc_step for x in machines]
     bad = [
-        f"{case.name} ({context.name}): {describe(int(code))}"
+        f"`{case.name}` ({context.name}): {describe(int(code))}"
         for context in machines
         for case, code in zip(context.runs.cases, context.runs.status, strict=True)
         if code
