@@ -170,8 +170,8 @@ def _contributions(findings: AtlasFindings) -> Chapter | None:
     links = ["link 1", "link 2", "link 3"]
     rows: list[list[str]] = []
     drawn: list[Drawing] = []
-    text = f"""Control of modes 2 and up beside mode 1 changes a mean square by at most
-    {span(beyond, ".2g")} % of its value without control; subsets of modes are run where that is
+    text = f"""Control of modes 2 and up beside mode 1 changes a mean square by up to
+    {beyond.max():.2g} % of its value without control; subsets of modes are run where that is
     more than {100 * MATTERS:.4g} %."""
     if subsets is not None:
         labels = findings.labels(subsets)

@@ -56,7 +56,7 @@ def say(exported: Exported) -> Report:
         chapters=[
             chapter(
                 "What was exported",
-                Items([title, package, law]),
+                Items([package, law]),
                 " ".join(wiring),
                 f"""Linearised sampled loop with the exported coefficients: spectral radius
                 {loop.spectral_radius:.6f}, gain margin {margin}.""",
@@ -87,7 +87,7 @@ def _in_the_loop(exported: FixedController, verified: Verification) -> Chapter |
     if len(verified.runs) < 2:  # JAX alone
         return None
     controller, rows = exported.controller, []
-    heads = "platform against JAX: x, y [nm], phi [urad]", "ADC codes differ from sample"
+    heads = "platform against JAX: x, y [nm], φ [µrad]", "ADC codes differ from sample"
     for name, run in verified.runs.items():
         rms = " / ".join(f"{1e6 * x:.5f}" for x in np.max(run.result.metrics.residual_rms, axis=1))
         at = verified.deviation(name)
@@ -103,7 +103,7 @@ def _in_the_loop(exported: FixedController, verified: Verification) -> Chapter |
         f"""The case's motion ({exported.structure.n_steps} samples), the plant in JAX, whose
         controller takes up to {peak:.4g} V, {100 * peak / controller.voltage_limit:.2g} % of the
         limit.""",
-        Rows(["controller", "residual rms of links 1, 2, 3 [µm]", *heads], rows),
+        Rows(["controller", "residual rms by link [µm]", *heads], rows),
         f"""One ADC code stands for {1e3 * code:.3g} mV at a sensor{seen if bent else ""}: residuals
         far below that depend on which code the noise falls on, and differ from run to run.""",
     )

@@ -117,7 +117,7 @@ def sentence(text: str) -> str:
 def print_result(report: Report, console: Console) -> None:
     """Print the result, a sentence a line."""
     for text in report.result:
-        console.print(text.replace("**", ""), soft_wrap=True)
+        console.print(_plain(text), soft_wrap=True)
 
 
 def print_report(report: Report, console: Console) -> None:
@@ -127,4 +127,9 @@ def print_report(report: Report, console: Console) -> None:
         if isinstance(part, Rows):
             print_rows(part, console)
         elif isinstance(part, str) and part:
-            console.print(" ".join(part.replace("`", "").split()), soft_wrap=True)
+            console.print(_plain(part), soft_wrap=True)
+
+
+def _plain(text: str) -> str:
+    """A text without marks, on one line."""
+    return " ".join(text.replace("**", "").replace("`", "").split())

@@ -59,8 +59,8 @@ def control_text(study: Study) -> str:
     if control.feedback == "none" or not links:
         return "no link controlled"
     law = LAWS[control.law]
-    what = f"{law.text} of {control.modes} modes" if law.channel == "mode" else law.text
+    modes = f" of {count_text(control.modes, 'mode')}" if law.channel == "mode" else ""
     return (
-        f"{what} on link{'s' if len(links) > 1 else ''} {', '.join(links)}, "
+        f"{law.text}{modes} on link{'s' if len(links) > 1 else ''} {', '.join(links)}, "
         f"{control.feedback} feedback, gain factor {control.gain_factor:g}"
     )

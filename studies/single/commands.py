@@ -79,7 +79,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         pose: Annotated[
             str | None,
             typer.Option(
-                help="x [m], y [m] and, of a rigid body, phi [rad], with commas between them, as "
+                help="x and y in m and, of a rigid body, phi in rad, with commas between them, as "
                 "in 0,0.01,0.5236; default: the first pose"
             ),
         ] = None,

@@ -29,6 +29,7 @@ VERDICTS = {
     "calm": "hardly anything to suppress",
     "worse": "**control makes it worse**",
     "well": "control works",
+    "limits": "what the run met decides, see its status",
 }
 #: Settling later than without control is pointed out from this share on [1].
 LATER = 0.02
@@ -81,6 +82,8 @@ def _situation(run: Run, twin: Run | None) -> str:
         return "uncontrolled"
     if twin is None:
         return "alone"
+    if run.status != status.OK:
+        return "limits"
     left, free = (x.result.metrics.residual_rms.max() for x in (run, twin))
     if free < run.study.metrics.settling_band:
         return "calm"
@@ -105,7 +108,8 @@ def _outcome(run: Run, twin: Run | None, case: str) -> list[str]:
     if record is not None:
         distance = np.linalg.norm(record.pose_error[:, :2], axis=1).max()
         angle = np.abs(record.pose_error[:, 2:]).max(initial=0.0)
-        away = f"by at most {number(distance, 'm')} µm and {number(angle, 'm')} µrad"
+        turn = f" and {number(angle, 'm')} µrad" if record.pose_error.shape[1] > 2 else ""
+        away = f"by at most {number(distance, 'm')} µm{turn}"
     judged = f", gain margin {margin.margin_in_db(loop.gain_margin)}" if loop is not None else ""
     but = "; the link settles" if case == "margin" else ", but the link settles"
     return [
@@ -145,9 +149,7 @@ def _limits(run: Run) -> str:
         "a motor at its limit": float(metrics.motor_saturated_fraction),
     }
     warnings = [
-        f"{100 * share:.2g} % of the samples have {event}"
-        for event, share in shares.items()
-        if share > 0
+        f"{100 * x:.2g} % of the samples have {what}" for what, x in shares.items() if x > 0
     ]
     return f"CAUTION: {'; '.join(warnings)}." if warnings and run.status == status.OK else ""
 
@@ -157,7 +159,7 @@ def machine_notes(run: Run) -> list[str]:
     metrics, notes = run.result.metrics, []
     if np.max(metrics.residual_rms) < STICKING and run.study.machine.joint_friction == 0:
         notes.append(
-            "Less than 2 um is left: joints that rub decide there, since they hold a link that "
+            "Less than 2 µm is left: joints that rub decide there, since they hold a link that "
             "hardly bends (machine.joint_friction, here 0; small ball bearings have 0.05 to 0.5 "
             "mN m)."
         )
@@ -174,6 +176,7 @@ def _next_steps(run: Run, case: str, name: str) -> str:
     bends the links, and the loop responds to that"""
     return {
         "stopped": "lower the gains or slow the motion; the figures end where the run stopped.",
+        "limits": f"{remedy(run.status) or 'lower the gains or slow the motion'}.",
         "margin": f"""lower `control.gain_factor`, or move the patches: a section `[sweep]` in this
         study's file, with the axes `gain` and `placement`, shows where margins are larger (`studies
         init --from placement` is an example, for the paper's machine). `studies spillover {name}

@@ -191,7 +191,9 @@ def _smallest_change(certificate: Certificate) -> Chapter | None:
         f"{name} {value:.3g}" + (f" {units[name]}" if units[name] != "1" else "")
         for name, value in change.tolerances.items()
     )
-    rows = [[str(x.name), x.text.removeprefix(x.name), f"{x.size:+.2f}"] for x in change.parts]
+    rows = [
+        [str(x.name), x.text.removeprefix(x.name).strip(), f"{x.size:+.2f}"] for x in change.parts
+    ]
     return chapter(
         "The smallest change that breaks it",
         f"""Sizes are in units of tolerances ({sizes}; relative ones as
@@ -249,7 +251,7 @@ def _move(certificate: Certificate) -> Chapter | None:
         design's controller and with no link controlled: {motion}; residual over {1e3 * WINDOW:.4g}
         ms, starting {1e3 * residual_delay(move.study):.4g} ms after the reference trajectory, when
         the drives have settled.""",
-        Rows(["control", "residual rms of links 1 / 2 / 3 [µm]", "run"], _fast_rows(move)),
+        Rows(["control", "residual rms by link [µm]", "run"], _fast_rows(move)),
     )
 
 

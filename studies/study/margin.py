@@ -45,7 +45,9 @@ def stretch_text(margins: Mapping[float, float] | None) -> str:
     """Gain margins by the damping of longitudinal modes, in one line."""
     if margins is None:
         return GUESSED
-    each = ", ".join(f"{value:.3g} at {100 * zeta:g} %" for zeta, value in margins.items())
+    each = ", ".join(
+        f"{margin_text(value, 3)} at {100 * zeta:g} %" for zeta, value in margins.items()
+    )
     return f"gain margin by the damping of longitudinal modes, link.stretch_damping: {each}"
 
 

@@ -51,7 +51,7 @@ LINE = 120
 
 
 def plot(sweep: SweepData | str | Path, x: str | None, y: str, hue: str | None = None) -> Figure:
-    """Cases of status ok.
+    """Cases of status ok: what varies, and what ranks them.
 
     Args:
         sweep: its folder, or its data as read.
@@ -138,7 +138,7 @@ def _drawn(data: SweepData, name: str) -> np.ndarray:
 
 
 def front(data: SweepData, y: str) -> Figure:
-    """A metric over the gain margin, by peak voltage; black: cases that none beats in both.
+    """What ranks the cases over their gain margin, by peak voltage; black: none beats it in both.
 
     Args:
         data: with cases of status ok that have a gain margin.

@@ -78,7 +78,7 @@ def say(
         {show.ranking_text(data, metric, show.requirement(data, metric))}?
         {show.runs_text(spec.study)}""",
         next_steps=_next_steps(data, metric, best, folder),
-        top=[replace(sketch, caption=f"{sketch.caption}. Where cases differ, it is the best")],
+        top=[replace(sketch, caption=f"{sketch.caption}. Where cases differ: the best")],
         chapters=[
             _best_cases(data, metric, best),
             chapter("How the cases ended", show.status_rows(data)),
@@ -146,7 +146,7 @@ def _run_texts(data: SweepData, agreed: Agreement | None) -> list[str]:
 
 def _next_steps(data: SweepData, metric: str, best: np.ndarray, folder: str) -> str:
     if not len(best):
-        return f"`studies show {folder} --failed` lists the failed cases."
+        return f"`studies show {folder} --failed` lists the failed cases, and what that depends on."
     condition = show.requirement(data, metric)
     subject = f' --subject-to "{condition}"' if condition else ""
     others = [x for x in OTHERS if x in data.variables and x != metric.partition("[")[0]]

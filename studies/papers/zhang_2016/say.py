@@ -263,13 +263,6 @@ def _reasons(machines: Machines) -> Chapter | None:
             {runs.loops["difference"].gain_margin:.3g},
             {runs.result.metrics.peak_voltage[k].max():.3g} V at the actuators."""
         )
-    if {"ideal", "paper-preset"} <= cases.keys():
-        sampled, ideal = (residual[cases[name]].max() for name in ("paper-preset", "ideal"))
-        texts.append(
-            f"""**Ideal feedback**, as in the paper's simulation, has neither delay nor converter:
-            the residual vibration is {sampled / ideal:.0f} times smaller than in the sampled loop
-            with the same gains."""
-        )
     return chapter("Why the numbers differ", Items(texts))
 
 

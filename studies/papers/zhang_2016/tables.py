@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 
 from studies.papers.zhang_2016.cases import (
     ALL,
@@ -224,7 +223,7 @@ def design_rows(context: Context) -> list[list[str]]:
             zeta = ", ".join(f"{z:.3f}" for z in loop.damping_ratio.min(axis=1))
         rows.append(
             [
-                Markup("<code>{}</code>").format(case.name),
+                case.name,
                 case.feedback,
                 case.estimator,
                 f"{case.gain_factor:g}",

@@ -80,7 +80,7 @@ def test_a_template_becomes_a_whole_page(fill_report):
         '"</pre><script>"',
     ):
         assert part in found.text
-    assert "<figcaption>Bending of <code>link</code>, *all*</figcaption>" in html
+    assert "<figcaption>Bending of <code>link</code>, *all*.</figcaption>" in html
     assert "<td>control.<wbr>gain<wbr>[0]</td>" in html
     links = re.findall('<a href="#([^"]*)">', html)
     assert links[1:] == ["versions", "study-file"] and links[0].startswith("numbers-of-script")
