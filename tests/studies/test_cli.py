@@ -212,7 +212,7 @@ def test_the_report_of_a_run_is_whole(short_folder, short_run):
     assert len(found.images) == 4 and found.rows == [[8] * 4, [4] * 4, [3] * 4, [2] * 9]
     rms = f"{1e6 * float(short_run.residual_rms[1].max()):.4g}"
     margin = f"gain margin {margin_in_db(float(short_run.gain_margin))}, the factor"
-    watched = f"The run ends {50 - 1e3 * float(short_run.command_end):.4g} ms after"
+    watched = f"the run ends {50 - 1e3 * float(short_run.command_end):.4g} ms after"
     for part in (
         "Status: ok.",
         watched,
