@@ -40,8 +40,10 @@ PLUGINS = ("pytest_timeout", "no:cacheprovider", "no:unraisableexception")
 #: What a copy of the checkout leaves out.
 ELSEWHERE = (
     *(".git", "_build", ".mypy_cache", ".ruff_cache", ".pytest_cache", ".hypothesis"),
-    *(".venv*", "results"),
+    ".venv*",
 )
+#: The same of its top only: below, a package has this name.
+ELSEWHERE_ON_TOP = ("results",)
 #: Stands in place of the failing test where none could run.
 STOPS = {2: "import of a test", 4: "import of conftest", -signal.SIGXCPU: "time limit"}
 #: Called before each statement with its file and line.
@@ -65,8 +67,13 @@ class Ended(NamedTuple):
 
 def copy(folder: Path, top: Path) -> None:
     """A checkout, anew, in a folder."""
+
+    def left_out(place: str, names: list[str]) -> set[str]:
+        more = ELSEWHERE_ON_TOP if Path(place) == top else ()
+        return shutil.ignore_patterns(*ELSEWHERE, *more)(place, names)
+
     shutil.rmtree(folder, ignore_errors=True)
-    shutil.copytree(top, folder, symlinks=True, ignore=shutil.ignore_patterns(*ELSEWHERE))
+    shutil.copytree(top, folder, symlinks=True, ignore=left_out)
 
 
 def load_libraries() -> None:

@@ -44,7 +44,7 @@ def test_shards_leave_nothing_behind(tmp_path):
     axes = {"placement": {"kind": "same"}, "gain": {"from": 0.1, "to": 1.0}}
     spec = small_spec({"method": "random", "count": 24 * 256, "axes": axes})
     watched = Watched()
-    run_screen(screen_of(spec, shard_size=256), tmp_path / "out", True, watched)
+    run_screen(screen_of(spec, shard_size=256), tmp_path / "out", True, screener=watched)
     memory, handles, threads = (np.array(x) for x in zip(*watched.notes, strict=True))
     assert len(memory) == 24
     assert handles[12:].max() <= handles[6:12].max()

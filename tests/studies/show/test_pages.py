@@ -17,7 +17,7 @@ from studies.show import pages
 from studies.show.figures import SMALL, WIDTH, is_wide, new_figure, styled
 from studies.show.listing import Rows
 from studies.show.pages import page, render
-from studies.show.report import Drawing, Items, Report, chapter, sentence
+from studies.show.report import Drawing, Items, Report, chapter, drawing, sentence
 from studies.study import spec as spec_module
 from studies.study.spec import Study, parse_study
 from studies.study.template import own_text, toml_text
@@ -103,6 +103,23 @@ def test_a_report_begins_with_its_result(fill_report):
     text = text_of(fill_report(text="**it** moves by 5 %"))
     first = ["# Title", "**Result:** **It** moves by 5 %.", "**Question:** Why?"]
     assert text.split("\n\n")[:4] == [*first, "**Next steps:** none"]
+
+
+def test_a_figure_s_caption_is_what_its_function_says():
+    def plot(value, ax):
+        """Something over time.
+
+        Dotted: more.
+
+        Args:
+            value: not in the caption.
+        """
+        ax.plot([0.0, value])
+
+    made = drawing(plot, 3.0, name="curve", height=2.0)
+    assert (made.name, made.caption) == ("curve", "Something over time.\n\nDotted: more.")
+    assert made.draw().axes[0].lines[0].get_ydata().tolist() == [0.0, 3.0]
+    assert drawing(plot, 3.0).name == "plot"
 
 
 def test_small_text_in_a_figure_is_found():
