@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from jinja2 import DictLoader
 from matplotlib.figure import Figure
+from rich.console import Console
 
 from studies.show import pages
 from studies.show.figures import SMALL, WIDTH, is_wide, new_figure, styled
 from studies.show.listing import Rows
 from studies.show.pages import page, render
-from studies.show.report import Drawing, Items, Report, chapter, drawing, sentence
+from studies.show.report import Drawing, Items, Report, chapter, drawing, print_report, sentence
 from studies.study import spec as spec_module
 from studies.study.spec import Study, parse_study
 from studies.study.template import own_text, toml_text
@@ -103,6 +104,16 @@ def test_a_report_begins_with_its_result(fill_report):
     text = text_of(fill_report(text="**it** moves by 5 %"))
     first = ["# Title", "**Result:** **It** moves by 5 %.", "**Question:** Why?"]
     assert text.split("\n\n")[:4] == [*first, "**Next steps:** none"]
+
+
+def test_a_console_shows_result_texts_and_tables():
+    said = io.StringIO()
+    parts = chapter("Head", "`code`\n   and **strong**", Rows(["name"], [["cell"]]), Items(["no"]))
+    report = Report("T", ["**first**"], "why?", "none", [None], [parts, None], {}, "caveat")
+    print_report(report, Console(file=said, width=40))
+    lines = said.getvalue().splitlines()
+    assert lines[:2] == ["first", "code and strong"] and lines[-1] == "caveat"
+    assert any("cell" in line for line in lines) and not any("no" in line for line in lines[5:])
 
 
 def test_a_figure_s_caption_is_what_its_function_says():
