@@ -38,7 +38,7 @@ def say(exported: Exported) -> Report:
     count = f" of {len(verified.checks)}" if failed else ""
     agree = f"{len(verified.checks) - len(failed)}{count} comparisons agree"
     margin, warning = margin_in_db(loop.gain_margin), caution(loop.gain_margin)
-    title, package, law, *wiring = exported.origin
+    _, package, law, *wiring = exported.origin
     checks = [[x.what, x.found, x.allowed, "ok" if x.is_met else "FAILED"] for x in verified.checks]
     return Report(
         title=f"Verification: {verdict}: {study.title or 'untitled study'}",

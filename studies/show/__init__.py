@@ -1,8 +1,8 @@
 """Presentation: figures, pages, formatted numbers.
 
-In: results. Out: HTML with figures inside. `pages` fills the `report.html` templates next to the
-modules; `units` writes numbers in readable units; `sketch` draws a machine; `figures` defines the
-style of all drawings.
+In: what a feature's `say` makes of a result (`report`). Out: a page with figures inside, a card for
+a notebook (`pages`), text on a console. `units` writes numbers in readable units; `sketch` draws a
+machine; `figures` defines the style of all drawings.
 """
 
 import lazy_loader

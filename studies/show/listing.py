@@ -21,6 +21,9 @@ class Rows(NamedTuple):
     heads: list[str]
     rows: list[list[str]]
 
+    def __bool__(self) -> bool:
+        return bool(self.rows)
+
 
 def print_rows(listing: Rows, console: Console) -> None:
     """Print a table; where it is too wide, with its rows as columns, as many at a time as fit."""

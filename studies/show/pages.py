@@ -14,7 +14,6 @@ from __future__ import annotations
 import re
 from base64 import b64encode
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from hashlib import sha256
 from io import BytesIO
@@ -30,7 +29,7 @@ from studies.errors import printable
 from studies.publish import FAULT, REPORT
 from studies.show import figures
 from studies.show.listing import Rows
-from studies.show.report import Drawing, Report, sentence
+from studies.show.report import MACHINE, Drawing, Report, plain, sentence
 from studies.study.margin import GUESSED
 from studies.study.spec import Study
 from studies.study.template import own_text, study_template
@@ -107,7 +106,7 @@ def render(name: str, /, **values: Any) -> str:
     """Fill in a template.
 
     Args:
-        name: of its file, relative to `studies`: "tuning/report.html".
+        name: of its file, relative to `studies`: "show/page.html".
         values: by the names it uses; FILTERS are always available.
 
     Raises:
@@ -129,12 +128,12 @@ def page(report: Report, folder: Path | None = None) -> str:
     Raises:
         ValueError: a figure that is not in the folder.
     """
-    chapters = [x for x in report.chapters if x]
     script = (_ROOT / "show" / "page.js").read_text(encoding="utf-8")
     about = next((x for x in report.files.values() if isinstance(x, Study)), None)
     return render(
         "show/page.html",
-        report=replace(report, chapters=chapters, caveat=report.caveat or GUESSED),
+        report=report,
+        caveat=report.caveat or GUESSED,
         script=Markup(script),
         digest=b64encode(sha256(script.encode()).digest()).decode(),
         image=lambda name, caption: _image(folder, name, caption),
@@ -158,16 +157,14 @@ def write_report(report: Report, folder: Path, has_pdf: bool = False) -> None:
 def card(report: Report) -> str:
     """A report as a notebook shows it: its result, the first rows of its table, a small picture."""
     table = next((x for x in report.parts if isinstance(x, Rows)), Rows([], []))
-    drawings = (x for x in report.parts if isinstance(x, Drawing))
-    first, *others = [*drawings, None]
-    shown = others[0] if others and others[0] else first  # the first one is the machine
+    drawings = [x for x in report.parts if isinstance(x, Drawing)]
+    shown = next((x for x in drawings if x.name != MACHINE), drawings[0] if drawings else None)
     image = ""
     if shown and shown.draw:
         with figures.styled():
             image = inline_image(_png(shown.draw()), shown.caption)
-    return render(
-        "show/card.html", report=report, image=image, heads=table.heads, rows=table.rows[:MOST]
-    )
+    rows = table.rows[:MOST]
+    return render("show/card.html", report=report, image=image, heads=table.heads, rows=rows)
 
 
 def _png(figure: Figure) -> bytes:
@@ -194,7 +191,6 @@ def _verified(study: Study | None) -> dict[str, str]:
 def _image(folder: Path | None, name: str, caption: str) -> Markup:
     if folder is None:
         return Markup()
-    name = name.removesuffix(".png")
     file = folder / (name if name.endswith(".gif") else f"{name}.png")
     if (fault := folder / f"{name}{FAULT}").is_file():
         return Markup("<p>{}</p>").format(fault.read_text(encoding="utf-8"))
@@ -215,6 +211,6 @@ def inline_image(data: bytes, caption: str) -> Markup:
     return Markup('<img src="data:image/{};base64,{}" alt="{}"{}>').format(
         "png" if is_png else "gif",
         b64encode(data).decode(),
-        caption.replace("`", ""),
+        plain(caption),
         Markup(' class="wide"') if width > WIDE else "",
     )

@@ -37,6 +37,14 @@ class Items:
         return bool(self.texts)
 
 
+#: Name of the figure of a machine, and what it shows.
+MACHINE = "machine"
+CAPTION = (
+    "The machine at its first way-point, and its links to scale, each from its face and, below, "
+    "from its edge; blue: links under control, grey: the others, orange: actuators, green: "
+    "sensors, on opposite faces, red: the path of the platform's reference point, enlarged where "
+    "it is short, black cross: a payload's centre of mass"
+)
 #: What stands below a heading; what is empty is left out.
 Part = str | Rows | Drawing | Items | None
 
@@ -54,13 +62,16 @@ class Report:
     """What is told: the result in sentences first, then what was asked, and what to do next."""
 
     title: str
-    result: Sequence[str]
+    result: Sequence[str]  # empty texts are left out
     question: str
     next_steps: str
     top: Sequence[Part]  # below these
     chapters: Sequence[Chapter | None]
     files: Mapping[str, Study | str]  # to append, by title; the first study is the one reported on
     caveat: str = ""  # what is to be said of margins, if there are any; "": they leave stretch out
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "result", [text for text in self.result if text])
 
     @property
     def parts(self) -> list[Part]:
@@ -70,7 +81,7 @@ class Report:
 
 def chapter(title: str, *parts: Part) -> Chapter | None:
     """A heading with what is not empty of some parts; None if all are."""
-    shown = [part for part in parts if part and (part.rows if isinstance(part, Rows) else True)]
+    shown = [part for part in parts if part]
     return Chapter(title, shown) if shown else None
 
 
@@ -98,11 +109,15 @@ def drawing(
     return Drawing(name or draw.__name__, caption, made)
 
 
-def machine(study: Study) -> Drawing:
-    """The sketch of a study's machine."""
-    from studies.show.sketch import CAPTION, sketch
+def machine(study: Study | Callable[[], Study], more: str = "") -> Drawing:
+    """The sketch of a machine: of a study, or one that a function makes; more: to be said of it."""
 
-    return Drawing("machine", CAPTION, partial(sketch, study))
+    def draw() -> Any:
+        from studies.show.sketch import sketch
+
+        return sketch(study() if callable(study) else study)
+
+    return Drawing(MACHINE, f"{CAPTION}. {more}" if more else CAPTION, draw)
 
 
 def sentence(text: str) -> str:
@@ -117,7 +132,7 @@ def sentence(text: str) -> str:
 def print_result(report: Report, console: Console) -> None:
     """Print the result, a sentence a line."""
     for text in report.result:
-        console.print(_plain(text), soft_wrap=True)
+        console.print(plain(text), soft_wrap=True)
 
 
 def print_report(report: Report, console: Console) -> None:
@@ -127,9 +142,9 @@ def print_report(report: Report, console: Console) -> None:
         if isinstance(part, Rows):
             print_rows(part, console)
         elif isinstance(part, str) and part:
-            console.print(_plain(part), soft_wrap=True)
+            console.print(plain(part), soft_wrap=True)
 
 
-def _plain(text: str) -> str:
+def plain(text: str) -> str:
     """A text without marks, on one line."""
     return " ".join(text.replace("**", "").replace("`", "").split())

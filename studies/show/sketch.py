@@ -16,12 +16,6 @@ from studies.study.spec import Study
 
 #: Colours of controlled links, other links, actuators and sensors.
 ON, OFF, ACTUATOR, SENSOR = figures.SERIES[0], "#888888", figures.SERIES[1], figures.SERIES[2]
-CAPTION = (
-    "The machine at its first way-point, and its links to scale, each from its face and, below, "
-    "from its edge; blue: links under control, grey: the others, orange: actuators, green: "
-    "sensors, on opposite faces, red: the path of the platform's reference point, enlarged where "
-    "it is short, black cross: a payload's centre of mass"
-)
 #: How far patches stand out of a link of the whole machine, as a share of the machine's size.
 OUTSTANDING = 0.018
 #: Largest thickness drawn, as a share of the longest link, and factors on true thickness.

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from studies import show  # whose `figures` load Matplotlib when they are needed
 from studies.engine.modes import NamedModes
 from studies.show.listing import Rows
 from studies.show.report import Report, chapter, drawing
@@ -27,16 +28,14 @@ def say(modes: NamedModes) -> Report:
 
 def _bars(modes: NamedModes) -> Any:
     """Energy of the lowest modes, by what holds it."""
-    from studies.show import figures
-
-    figure, ax = figures.one_panel(2.0)
+    figure, ax = show.figures.one_panel(2.0)
     shares = np.array([*modes.link_share.sum(axis=2).T, modes.drive_share])[:, :MOST]
     shares = 100 * np.nan_to_num(shares)
     for k, share in enumerate(shares):
         name = f"link {k + 1}" if k < len(shares) - 1 else "drive"
         place, base = np.arange(len(share)), shares[:k].sum(axis=0)
-        ax.bar(place, share, bottom=base, color=figures.SERIES[k], label=name)
+        ax.bar(place, share, bottom=base, color=show.figures.SERIES[k], label=name)
     ax.set_xticks(place, [f"{f:.0f}" for f in modes.frequency[:MOST]])
     ax.set(xlabel="frequency [Hz]", ylabel="energy [%]")
-    figures.legend_above(figure, ax)
+    show.figures.legend_above(figure, ax)
     return figure

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-import numpy as np
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from studies import show  # whose `figures` load Matplotlib when they are needed
 from studies.engine.run_data import chord_deflection
 from studies.engine.runs import Run
-from studies.show import figures
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 #: Of the residual window and of markers.
 GREY = "#888888"
@@ -33,13 +37,13 @@ def voltage(run: Run) -> Figure:
 def _over_time(run: Run, rows: dict[str, np.ndarray], names: list[str]) -> Figure:
     """A panel of each quantity, (T, n) by its label; names: of the n curves, [] for one."""
     assert run.result.record is not None
-    figure, axes = figures.new_figure(len(rows), 1, 1.3)
+    figure, axes = show.figures.new_figure(len(rows), 1, 1.3)
     for ax, (label, values) in zip(axes[:, 0], rows.items(), strict=True):
-        figures.traces(1e3 * run.result.record.time, values, names, label, ax)
+        show.figures.traces(1e3 * run.result.record.time, values, names, label, ax)
         ax.axvline(1e3 * float(run.result.command_end), color=GREY, linewidth=0.8, linestyle=":")
     axes[-1, 0].set_xlabel("time [ms]")
     if names:
-        figures.legend_above(figure, axes[0, 0])
+        show.figures.legend_above(figure, axes[0, 0])
     return figure
 
 
@@ -56,8 +60,9 @@ def deflection(run: Run, twin: Run | None) -> Figure:
     within = (time >= window[0]) & (time <= window[1])
     bent = [1e6 * chord_deflection(x) for x in (twin, run) if x is not None]
     is_fed_back = run.study.control.feedback != "none"
-    styles = [figures.WITHOUT, figures.CONTROLLED if is_fed_back else figures.WITHOUT][-len(bent) :]
-    figure, axes = figures.new_figure(run.study.n_links, 1 + bool(time[-1] > end), 1.4)
+    held = show.figures.CONTROLLED if is_fed_back else show.figures.WITHOUT
+    styles = [show.figures.WITHOUT, held][-len(bent) :]
+    figure, axes = show.figures.new_figure(run.study.n_links, 1 + bool(time[-1] > end), 1.4)
     for link, (whole, *rest) in enumerate(axes):
         for ax in (whole, *rest):
             for values, style in zip(bent, styles, strict=True):
@@ -74,5 +79,5 @@ def deflection(run: Run, twin: Run | None) -> Figure:
     for ax in axes[-1]:
         ax.set_xlabel("time [ms]")
     if twin is not None:
-        figures.legend_above(figure, axes[0, 0])
+        show.figures.legend_above(figure, axes[0, 0])
     return figure

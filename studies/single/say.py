@@ -62,7 +62,7 @@ def say(
     ]
     return Report(
         title=f"{study.title or 'untitled study'}: one run",
-        result=[text for text in result if text],
+        result=result,
         question=f"{motion_text(study)}; {control_text(study)}: how much vibration is left?",
         next_steps=_next_steps(run, case, name),
         top=[run.result.record and machine(study)],

@@ -96,7 +96,7 @@ def say(certificate: Certificate) -> Report:
     return Report(
         title=f"{study.title or 'untitled study'}: spillover certificate "
         f"{'passed' if certificate.is_passed else 'failed'}",
-        result=[text for text in result if text],
+        result=result,
         question=f"""{study.title or "the study"}: is its controller stable on {plants} plants that
         differ from its nominal model, with a gain margin of {certificate.required_margin:g} on
         each?""",
@@ -196,9 +196,8 @@ def _smallest_change(certificate: Certificate) -> Chapter | None:
     ]
     return chapter(
         "The smallest change that breaks it",
-        f"""Sizes are in units of tolerances ({sizes}; relative ones as
-        natural logarithms; other ones: `--tolerance NAME=VALUE`), and the distance is
-        Euclidean.""",
+        f"""Sizes are in units of tolerances ({sizes}; relative ones as natural logarithms; other
+        ones: `--tolerance NAME=VALUE`), and the distance is Euclidean.""",
         Rows(["number", "change", "in tolerances"], rows),
     )
 
@@ -228,10 +227,10 @@ def _spillover(certificate: Certificate) -> Chapter | None:
     return chapter(
         title,
         f"""What one unit of an uncontrolled mode adds to the estimate q^j of a controlled one: the
-        largest value over all links and mismatches. Worst: mode {mode} in q^{estimate},
-        {seen:.3g} ({plant.basis}, {plant.mismatch}). Control spillover: a force on a
-        controlled mode excites uncontrolled ones by up to {pushed:.3g} of itself (mode
-        {controlled} on mode {excited}, {other.basis}).""",
+        largest value over all links and mismatches. Worst: mode {mode} in q^{estimate}, {seen:.3g}
+        ({plant.basis}, {plant.mismatch}). Control spillover: a force on a controlled mode excites
+        uncontrolled ones by up to {pushed:.3g} of itself (mode {controlled} on mode {excited},
+        {other.basis}).""",
         Rows(["basis", "estimate", *(f"mode {r + 1}" for r in range(first, last))], rows),
         drawing(plots.leakage, certificate),
     )
@@ -247,10 +246,10 @@ def _move(certificate: Certificate) -> Chapter | None:
         move of {1e3 * FAST[0]:g} mm in {1e3 * FAST[1]:.4g} ms), no shaper"""
     return chapter(
         "With and without control" if move.move_time is None else "The fast move",
-        f"""Nonlinear runs of the nominal machine with the
-        design's controller and with no link controlled: {motion}; residual over {1e3 * WINDOW:.4g}
-        ms, starting {1e3 * residual_delay(move.study):.4g} ms after the reference trajectory, when
-        the drives have settled.""",
+        f"""Nonlinear runs of the nominal machine with the design's controller and with no link
+        controlled: {motion}; residual over {1e3 * WINDOW:.4g} ms, starting
+        {1e3 * residual_delay(move.study):.4g} ms after the reference trajectory, when the drives
+        have settled.""",
         Rows(["control", "residual rms by link [µm]", "run"], _fast_rows(move)),
     )
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -69,7 +68,6 @@ def say(
     metric, spec = show.ranking(data), data.spec
     best = show.recommended(data, metric) if show.is_ranked(data, metric) else np.array([], int)
     shown_study = case_study(data.table, int(best[0])) if len(best) else spec.study
-    sketch = machine(shown_study)
     return Report(
         title=f"{spec.study.title or 'untitled study'}: sweep",
         result=[*_best_texts(data, metric, best), *_run_texts(data, agreed)],
@@ -78,7 +76,7 @@ def say(
         {show.ranking_text(data, metric, show.requirement(data, metric))}?
         {show.runs_text(spec.study)}""",
         next_steps=_next_steps(data, metric, best, folder),
-        top=[replace(sketch, caption=f"{sketch.caption}. Where cases differ: the best")],
+        top=[machine(shown_study, "Where cases differ: the best")],
         chapters=[
             _best_cases(data, metric, best),
             chapter("How the cases ended", show.status_rows(data)),

@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from jaxmodel import status
 from jaxmodel.loop_figures import MARGIN_MODES, MARGINS, PEAKS
@@ -15,11 +14,11 @@ from jaxmodel.metrics import METRICS
 from studies.engine.fidelity import rank_correlation
 from studies.engine.poles import HEADER, difference, pole_rows
 from studies.show.listing import Rows
-from studies.show.report import Chapter, Drawing, Part, Report, chapter, drawing
-from studies.show.sketch import CAPTION, sketch
+from studies.show.report import Chapter, Part, Report, chapter, drawing, machine
 from studies.show.units import count_text, headed, is_cut_off, number, readable, settling_text
 from studies.study.entries import links_text, parse_entries
 from studies.study.margin import caution, margin_in_db, margin_text
+from studies.study.spec import Study
 from studies.study.template import toml_text
 from studies.tuning import plots
 from studies.tuning.audit import ALLOWED, MEANING
@@ -68,9 +67,7 @@ def say(findings: TuneFindings, folder: str = "") -> Report:
         next_steps=f"""`studies simulate {file} --out run.h5 --report` for its trajectories,
         `studies spillover {file} --out certificate` before it runs on a machine, `studies export
         {file} --target c --out dsp` for the controller.""",
-        top=[
-            Drawing("machine", f"{CAPTION}. The best design is shown", partial(_sketch, findings))
-        ],
+        top=[machine(partial(_best_study, findings), "The best design is shown")],
         chapters=[
             _own_machine(findings),
             _fresh(findings),
@@ -204,12 +201,9 @@ def _bound(name: str, value: float | str) -> str:
     return f"{name} {'at least' if name in LOWER else 'at most'} {shown}"
 
 
-def _sketch(findings: TuneFindings) -> Figure:
-    """The machine of the best design."""
+def _best_study(findings: TuneFindings) -> Study:
     spec, at, k = findings.spec, findings.at, best_family(findings.spec, findings)
-    return sketch(
-        tuned_study(spec, spec.families[k], spec.free.values(at.best_place[at.winner(k)]))
-    )
+    return tuned_study(spec, spec.families[k], spec.free.values(at.best_place[at.winner(k)]))
 
 
 def _of_loop(spec: TuneSpec) -> list[str]:

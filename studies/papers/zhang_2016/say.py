@@ -174,7 +174,7 @@ def _settling(machines: Machines) -> Chapter | None:
 
 
 def _ratios(machines: Machines) -> Chapter | None:
-    largest = _agreement(machines.fitted)["second"].max()
+    largest = energy_ratio(machines.fitted)[:, 1].max()
     return chapter(
         "Gain ratios of efficient modal control: (26) and (27)",
         "Ours by (24) from the time mean of E = ω²q² + q'² while moving, without control.",

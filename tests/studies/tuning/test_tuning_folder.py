@@ -305,8 +305,8 @@ def test_a_family_that_keeps_the_limits_comes_before_a_better_one():
 def test_the_machine_shown_is_the_recommended_one():
     spec, found = loud_and_calm()
     made_up = {"tuned_study": lambda *x: spec.study.change(control__gain_factor=x[2][0])}
-    with mock.patch.multiple(say_module, sketch=lambda study: study, **made_up):
-        study = say_module._sketch(found)
+    with mock.patch.multiple(say_module, **made_up):
+        study = say_module._best_study(found)
     loud, calm = spec.free.values(found.at.best_place)[:, 0]
     assert study.control.gain_factor == calm != loud
     with mock.patch.multiple(tuning_run, **made_up):
