@@ -18,17 +18,17 @@ help:  ## this list
 install: .venv/installed  ## set up the environment .venv, nothing else
 
 study: .venv/installed  ## run the study of the paper and a sweep of patch placements
+	rm -rf results/paper results/placement
 	$(BIN)/studies paper zhang_2016 --out results/paper
-	rm -rf results/placement
 	$(BIN)/studies sweep placement --out results/placement --report
 	$(BIN)/studies best results/placement --by residual_rms --subject-to "gain_margin > 2" --count 5
 	$(BIN)/studies plot results/placement --out results/placement/best.png
 
 explore: .venv/installed  ## coupling of the links, spillover of three designs, all notebooks
-	rm -rf results/atlas
+	rm -rf results/atlas results/certificate-*
 	$(BIN)/studies atlas --out results/atlas
 	for design in paper paper_gains difference; do \
-	  $(BIN)/studies spillover $$design --out results/spillover-$$design; [ $$? -lt 2 ] || exit 2; done
+	  $(BIN)/studies certify $$design --out results/certificate-$$design; [ $$? -lt 2 ] || exit 2; done
 	$(PYTEST) -m "long or not long" docs/tests/test_notebooks.py
 
 notebooks: .venv/with-notebook  ## open the notebooks in JupyterLab

@@ -32,7 +32,7 @@ EQUAL = 1e-8
 #: Works of `studies bench` with cases at once, and loops to judge.
 WORKS = {"W0": 32768, "W1": 8448, "W8": 8448, "grad": 1024}
 JUDGED = 8192
-#: A sweep of short runs with margins, and a screen of as short ones.
+#: A sweep of short runs with margins, and one of as short ones that keeps its best.
 CASES, DESIGNS = 65_536, 500_000
 SWEEP = """title = "judged"
 link = {{ modes = 2 }}
@@ -43,6 +43,7 @@ metrics = {{ residual_length = 0.01, residual_delay = 0.002 }}
 method = "sobol"
 count = {count}
 metrics = ["residual_rms"]
+{more}
 [sweep.axes]
 placement = {{ kind = "same" }}
 "control.gain_factor" = {{ from = 0.2, to = 2.0 }}
@@ -107,7 +108,7 @@ def judge(batch: int) -> None:
     from studies.space.spec import parse_sweep
 
     studies.configure()
-    study = parse_sweep(tomllib.loads(SWEEP.format(count=1))).study
+    study = parse_sweep(tomllib.loads(SWEEP.format(count=1, more=""))).study
     both = jax.jit(studies.batched(study, ["control.gain_factor"], is_judged=True))
     values, times = np.geomspace(0.1, 3.0, batch)[:, None], []
     for _ in range(2):
@@ -117,14 +118,14 @@ def judge(batch: int) -> None:
     print(json.dumps([*times, margins.tolist()]))
 
 
-def command(words: list[str], spec: str, is_gpu: bool, limit: float) -> Done:
-    """Time of a command on a file, start and compiling included."""
+def swept(spec: str, is_gpu: bool, limit: float) -> Done:
+    """Time of a sweep, start and compiling included."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "spec.toml"
         file.write_text(spec, encoding="utf-8")
         began = time.perf_counter()
-        given = [*CLI, words[0], str(file), "--out", str(Path(folder) / "out"), "--quiet"]
-        _, fault = run([*given, *words[1:]], is_gpu, limit)
+        given = [*CLI, "sweep", str(file), "--out", str(Path(folder) / "out"), "--no-progress"]
+        _, fault = run(given, is_gpu, limit)
         return Done(fault or f"{time.perf_counter() - began:.0f} s")
 
 
@@ -138,16 +139,13 @@ def works(share: int) -> dict[str, Callable[[bool, float], Done]]:
     for name, batch in WORKS.items():
         found[f"{name}, {at_once(batch)}"] = lambda *a, n=name, b=batch: stepped(n, b // share, *a)
     found[f"loops judged (on one core), {at_once(JUDGED)}"] = lambda *a: judged(JUDGED // share, *a)
-    for words, count, what in (
-        (["sweep"], CASES // share, "sweep of {:,} judged cases"),
-        (
-            ["screen", "--by", "residual_rms", "--keep", "100", "--margin", "0"],
-            DESIGNS // share,
-            "screen of {:,} designs",
-        ),
+    keep = 'keep = 100\nmargin = 0.0\nfidelity = "linear"'
+    for more, count, what in (
+        ("", CASES // share, "sweep of {:,} judged cases"),
+        (keep, DESIGNS // share, "sweep that keeps 100 of {:,} designs"),
     ):
-        spec = SWEEP.format(count=count)
-        found[what.format(count)] = lambda *a, w=words, s=spec: command(w, s, *a)
+        spec = SWEEP.format(count=count, more=more)
+        found[what.format(count)] = lambda *a, s=spec: swept(s, *a)
     return found
 
 

@@ -56,8 +56,8 @@ COMMANDS = (
     Timed("plot gains --out {out}.png", 2.5),
     Timed("simulate short.toml --out {out}.h5", 3.0),
     Timed("export paper --target c --out {out}", 6.0),
-    Timed("spillover paper --out {out}", 25.0),
-    Timed("tune calm.toml --out {out} --quiet", is_slow=True),
+    Timed("certify paper --out {out}", 25.0),
+    Timed("tune calm.toml --out {out} --no-progress", is_slow=True),
     Timed("fit paper_measured --out {out}", is_slow=True),
 )
 #: Limits of the first cases of a sweep [s], without and with compiled programs on disk.
@@ -102,7 +102,7 @@ class Checkout:
         """User and system time of `sweep gains` until its first cases are on disk [s]."""
         out = self.folder / "first"
         shutil.rmtree(out, ignore_errors=True)
-        process = self.start("sweep gains --out first --quiet")
+        process = self.start("sweep gains --out first --no-progress")
         while process.poll() is None and not list(out.glob("*/*.h5")):
             time.sleep(0.02)
         seconds = process_time(process.pid) if process.returncode is None else float("nan")
@@ -133,7 +133,7 @@ def measure(checkouts: list[Checkout], has_slow: bool) -> bool:
     print(*heads, "limit [s]")
     show("first cases of sweep gains, cold", [x.time_first_cases() for x in checkouts], FIRST_COLD)
     for checkout in checkouts:
-        checkout.time_command("sweep gains --out gains --quiet")
+        checkout.time_command("sweep gains --out gains --no-progress")
     show("first cases of sweep gains, warm", [x.time_first_cases() for x in checkouts], FIRST_WARM)
     for words, limit, is_slow in COMMANDS:
         if is_slow and not has_slow:

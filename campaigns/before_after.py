@@ -33,10 +33,10 @@ def jobs(out: Path) -> Iterator[tuple[str, ...]]:
     for name in DESIGNS:
         yield "simulate", name, "--out", str(out / f"{name}.h5")
     for name in SWEEPS:
-        yield "sweep", name, "--out", str(out / f"sweep_{name}"), "--quiet"
+        yield "sweep", name, "--out", str(out / f"sweep_{name}"), "--no-progress"
     yield "tune", TUNING, "--out", str(out / "tuning")
     for name in DESIGNS[:3]:
-        yield "spillover", name, "--out", str(out / f"certificate_{name}")
+        yield "certify", name, "--out", str(out / f"certificate_{name}")
     for target in TARGETS:
         for name in ("paper", "measured"):
             yield "export", name, "--target", target, "--out", str(out / f"{target}_{name}")

@@ -33,9 +33,9 @@ from studies.engine.folder import (
     FIT,
     MANIFEST,
     RESULTS,
+    SweepFolder,
     file_hash,
     make_manifest,
-    open_folder,
 )
 from studies.engine.folder import finished_cases as finished
 from studies.engine.results import DIGEST, baseline_digest, baseline_id, read_sweep
@@ -56,6 +56,7 @@ from studies.export.document import (
 from studies.fitting.explore import explore_fit
 from studies.fitting.spec import FileEntry, load_fit
 from studies.fitting.tables import column, read_columns
+from studies.job import locked_folder, working
 from studies.kernels import compilation
 from studies.kernels.compilation import ObjectCache, _key
 from studies.passport import Passport
@@ -68,8 +69,15 @@ from studies.study.spec import Study, load_study
 from studies.sweeps.run import case_content
 from studies.sweeps.show import print_cases, ranked_cases, show
 from studies.tuning import explore as tuning_explorer
+from studies.tuning.folder import (
+    CHECKED,
+    PROGRESS,
+    fixed_part,
+    load_progress,
+    refuse_edited,
+    save_progress,
+)
 from studies.tuning.folder import RESULTS as TUNED
-from studies.tuning.folder import open_tuning, save_progress
 from studies.tuning.optimise import Progress, is_compatible, start_families
 from studies.tuning.spec import load_tuning
 from tests.fits import RESPONSE, blank
@@ -197,14 +205,15 @@ def sweep_folder(folder):
     """A finished sweep with made-up numbers, and an unfinished one."""
     data = small({"axes": {"gain": [0.1, 0.5, 1.0], "controlled_modes": [1, 2]}})
     table, rng = build_table(parse_sweep(data)), np.random.default_rng(0)
-    manifest = make_manifest(data) | {CONTENT: case_content(parse_sweep(data), table)}
+    manifest = make_manifest(data) | {CONTENT: case_content(parse_sweep(data))}
     for name, count in (("whole", 6), ("part", 4)):
         chunk = {"case_id": table.case_id[:count]}
         for metric in (*PER_CASE, *METRICS):
             shape = (count, *(3 for _ in label_of(metric)[0]))
             codes = metric in ("status", "substeps")
             chunk[metric] = np.zeros(shape, int) if codes else rng.uniform(1, 2, shape)
-        with open_folder(folder / name, manifest, False) as out:
+        with locked_folder(folder / name, "sweep"):
+            out = SweepFolder(folder / name)
             out.begin(manifest)
             out.write_chunk(chunk)
             if count == len(table):
@@ -223,14 +232,20 @@ def sweep_folder(folder):
     return [folder / "whole", folder / "part"]
 
 
+def opened_tuning(out, spec, resume):
+    """The folder of a tuning, as `studies.tune` opens it."""
+    request = {"spec": spec.data, "code": ""}
+    return working("tune", out, request, (), resume, False, CHECKED, fixed_part)
+
+
 def tuning_folder(folder):
     spec = tuning(EVERY_KIND, starts=2, iterations=3)
     out, p = folder / "tuned", len(spec.free.names)
     starts, m = len(start_families(spec)), len(spec.limit_names)
     shapes = {"base_slope": (starts, p), "base_limits": (starts, m), "history": (3, starts, 2)}
     at = {name: np.zeros(shapes.get(name, (starts,))) for name in Progress._fields}
-    with open_tuning(out, {"spec": spec.data, "code": "", "jaxlib": "", "precision": ""}, False):
-        save_progress(out / "progress.npz", Progress(**at | {"descent": (np.zeros(3),)}))
+    with opened_tuning(out, spec, False):
+        save_progress(out / PROGRESS, Progress(**at | {"descent": (np.zeros(3),)}))
     shutil.copy(READY / "paper.toml", out / "tuned.toml")
     return [out]
 
@@ -348,11 +363,10 @@ def read_sweep_folder(path):
 def read_tuning_folder(path):
     load_design(path, None)
     spec = tuning(EVERY_KIND, starts=2, iterations=3)
-    with open_tuning(
-        path, {"spec": spec.data, "code": "", "jaxlib": "", "precision": ""}, True
-    ) as at:
-        if at is not None:
+    with opened_tuning(path, spec, True):
+        if (at := load_progress(path / PROGRESS)) is not None:
             is_compatible(spec, at)
+            refuse_edited(path)
 
 
 def read_sealed_sweep(path):

@@ -10,12 +10,13 @@ import numpy as np
 import psutil
 import pytest
 
+import studies
 from studies.engine.folder import CHUNKS
 from studies.engine.results import read_sweep
+from studies.job import working
 from studies.screen.local import LocalScreener
-from studies.screen.run import run_screen
+from studies.screen.run import PHASES, run_screen
 from studies.screen.shards import screen_of
-from studies.space.spec import load_sweep
 from studies.study.files import READY, read_toml
 from studies.study.template import toml_text
 from tests import TOP
@@ -42,9 +43,11 @@ class Watched(LocalScreener):
 def test_shards_leave_nothing_behind(tmp_path):
     """In short what ten million designs show."""
     axes = {"placement": {"kind": "same"}, "gain": {"from": 0.1, "to": 1.0}}
-    spec = small_spec({"method": "random", "count": 24 * 256, "axes": axes})
+    keep = {"keep": 10, "fidelity": "linear"}
+    spec = small_spec({"method": "random", "count": 24 * 256, "axes": axes} | keep)
     watched = Watched()
-    run_screen(screen_of(spec, shard_size=256), tmp_path / "out", True, screener=watched)
+    with working("sweep", tmp_path / "out", None, PHASES, progress=False) as job:
+        run_screen(screen_of(spec, 256), job, watched)
     memory, handles, threads = (np.array(x) for x in zip(*watched.notes, strict=True))
     assert len(memory) == 24
     assert handles[12:].max() <= handles[6:12].max()
@@ -72,24 +75,19 @@ def watch(arguments, limit):
     return np.array(notes)
 
 
-def wide(folder, count, name="wide.toml"):
-    """The ready-made wide search with this many designs."""
+def wide(folder, **sweep):
+    """The ready-made wide search with other fields of its sweep."""
     data = read_toml(READY / "wide_search.toml")
-    data["sweep"]["count"] = count
-    path = folder / name
-    path.write_text(toml_text(data))
+    path = folder / "wide.toml"
+    path.write_text(toml_text(data | {"sweep": data["sweep"] | sweep}))
     return path
-
-
-#: Few designs to judge, as memory while designs run is looked at.
-FEW = ("--keep", "10", "--margin", "0")
 
 
 @pytest.mark.long
 def test_ten_million_designs_take_no_more_memory_than_one(tmp_path):
-    path = wide(tmp_path, 10_000_000)
-    notes = watch(["screen", path, "--out", tmp_path / "out", "--quiet", *FEW], 3600.0)
-    memory, handles = notes[:-4].T  # without the report
+    path = wide(tmp_path, count=10_000_000, keep=10, margin=0.0)  # few to judge and to run
+    notes = watch(["sweep", path, "--out", tmp_path / "out", "--no-progress"], 7200.0)
+    memory, handles = notes[: len(notes) * 9 // 10].T  # without the runs of the full model
     tenth = len(memory) // 10
     assert memory[-tenth:].max() < 1.02 * memory[tenth : 2 * tenth].max() + 8 * MIB
     assert handles[-tenth:].max() <= handles[tenth : 2 * tenth].max()
@@ -102,7 +100,7 @@ def test_two_hundred_thousand_short_cases(tmp_path):
     sweep = {"method": "random", "count": 200_000, "axes": axes, "metrics": ["residual_rms"]}
     path = tmp_path / "sweep.toml"
     path.write_text(toml_text(small(sweep)))
-    notes = watch(["sweep", path, "--out", tmp_path / "out", "--quiet"], 3600.0)
+    notes = watch(["sweep", path, "--out", tmp_path / "out", "--no-progress"], 3600.0)
     memory, handles = notes.T
     half = len(memory) // 2
     assert memory[half:].max() < memory[half // 2 : half].max() + 200_000 * 1000
@@ -112,15 +110,20 @@ def test_two_hundred_thousand_short_cases(tmp_path):
     assert not (tmp_path / "out" / CHUNKS).exists()
 
 
+def true_best_found(folder, count, margin):
+    """Of the best 100 designs by the full model, how many a sweep by the linear one keeps."""
+    ids = {}
+    for fidelity, keep in (("full", 100), ("linear", 1000)):
+        path = wide(folder, count=count, margin=margin, fidelity=fidelity, keep=keep)
+        studies.sweep(path, folder / fidelity, progress=False)
+        ids[fidelity] = read_sweep(folder / fidelity)["case_id"]
+    return int(np.isin(ids["full"], ids["linear"]).sum())
+
+
 @pytest.mark.long
-def test_the_linear_model_finds_the_true_best(tmp_path):
+@pytest.mark.parametrize("margin", [0.0, 2.0])
+def test_the_linear_model_finds_the_true_best(tmp_path, margin):
     """Of a million designs, how many of the best 100 by the full model the linear one keeps."""
-    spec = load_sweep(wide(tmp_path, 1_000_000))
-    for margin in (0.0, 2.0):
-        asked = {"margin": margin, "shard_size": 2**18}
-        full = screen_of(spec, keep=100, fidelity="full", **asked)
-        true = run_screen(full, tmp_path / "full", True).selection.kept
-        linear = run_screen(screen_of(spec, keep=1000, **asked), tmp_path / "linear", True)
-        found = np.isin(true.row, linear.selection.kept.row).sum()
-        print(f"margins from {margin}: of the true best 100, {found} are among the 1000 kept")
-        assert found >= 95
+    found = true_best_found(tmp_path, 1_000_000, margin)
+    print(f"margins from {margin}: of the true best 100, {found} are among the 1000 kept")
+    assert found >= 95

@@ -15,15 +15,15 @@ def main() -> None:
     studies.configure()
     fast = studies.Study()
     runs = {
-        "without control": studies.run_study(fast.change(control__gain_factor=0.0)),
-        "with control": studies.run_study(fast),
+        "without control": studies.simulate(fast.change(control__gain_factor=0.0)),
+        "with control": studies.simulate(fast),
     }
     figure, axes = plt.subplots(3, 1, sharex=True, figsize=(7, 5), layout="constrained")
     for (label, run), color in zip(runs.items(), ("0.6", "C0"), strict=True):
-        time = 1e3 * (run.result.record.time - run.result.command_end)
-        for axis, deflection in zip(axes, 1e6 * studies.chord_deflection(run).T, strict=True):
+        time = 1e3 * (run.data.time - run.data.command_end)
+        for axis, deflection in zip(axes, 1e6 * run.data.chord_deflection.values.T, strict=True):
             axis.plot(time, deflection, color=color, lw=1.2, label=label)
-    windows = runs["with control"].case.windows
+    windows = runs["with control"].run.case.windows
     begin = 1e3 * float(windows.residual_delay)
     end = begin + 1e3 * float(windows.residual_length)
     for i, axis in enumerate(axes):

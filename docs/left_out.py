@@ -129,7 +129,7 @@ def main() -> None:
     machines["stubby"] = machines["default"].change(**STUBBY)
     if len(sys.argv) > 1:
         try:
-            machines = {sys.argv[1]: studies.load_study(sys.argv[1])}
+            machines = {sys.argv[1]: studies.load(sys.argv[1])}
         except studies.StudyError as error:
             sys.exit(f"left_out: {error}")
     found = [rows(study) for study in machines.values()]

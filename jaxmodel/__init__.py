@@ -2,7 +2,7 @@
 
 Data flow: `Machine` and `Case` (physical numbers) -> `prepare` (matrices, coefficients) ->
 `command` (shaped reference, noise) -> `step` per sample (controller, plant, metrics, status) ->
-`Result`. Importing this package has no effect; set precision and devices before the first call.
+`RunResult`. Importing this package has no effect; set precision and devices before the first call.
 """
 
 import lazy_loader

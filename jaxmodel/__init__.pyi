@@ -11,14 +11,14 @@ from .parameters import Machine
 from .plant import build_plant
 from .prepare import prepare
 from .sampled_loop import closed_loop
-from .simulate import Result, command, simulate
+from .simulate import RunResult, command, simulate
 
 __all__ = [
     "BASES",
     "HOME",
     "Case",
     "Machine",
-    "Result",
+    "RunResult",
     "Structure",
     "accelerations",
     "build_basis",

@@ -25,7 +25,7 @@ from jaxmodel.prepare import Prepared, prepare
 from jaxmodel.shaper import last_sample
 
 
-class Result(NamedTuple):
+class RunResult(NamedTuple):
     """Outcome of a run."""
 
     # NaN if the run did not finish; derivatives are 0 then, so that a sum over the cases of a batch
@@ -313,7 +313,7 @@ def _allowed_compression(case: Case, plant: Plant) -> Array:
     return critical_force(plant)
 
 
-def conclude(outline: Outline, code: Array, last: State, record: Record | None = None) -> Result:
+def conclude(outline: Outline, code: Array, last: State, record: Record | None = None) -> RunResult:
     """Judge a run.
 
     Args:
@@ -323,7 +323,7 @@ def conclude(outline: Outline, code: Array, last: State, record: Record | None =
         record: trajectories to pass on.
 
     Returns:
-        Result.
+        RunResult.
     """
     result = metrics.finish(last.totals, outline.ending)
     final = last.status
@@ -347,7 +347,7 @@ def conclude(outline: Outline, code: Array, last: State, record: Record | None =
     # zeros from a stopped run would look like perfect results
     is_finished = reduce(jnp.logical_or, (final == code for code in status.FINISHED))
     result = jax.tree.map(lambda x: jnp.where(is_finished, x, jnp.nan), result)
-    return Result(
+    return RunResult(
         metrics=result,
         status=final.astype(jnp.int32),
         bad_time=jnp.where(code == status.OK, last.bad_time, outline.early_time),
@@ -360,7 +360,7 @@ def conclude(outline: Outline, code: Array, last: State, record: Record | None =
 
 
 @compiled("structure", "has_record")
-def simulate(structure: Structure, case: Case, has_record: bool = False) -> Result:
+def simulate(structure: Structure, case: Case, has_record: bool = False) -> RunResult:
     """Run one case with the reference executor, a scan; other executors replace only the scan.
 
     Args:
@@ -369,8 +369,8 @@ def simulate(structure: Structure, case: Case, has_record: bool = False) -> Resu
         has_record: return trajectories too (static).
 
     Returns:
-        Result, whose `status` says what went wrong; nothing is raised inside. Its derivatives are
-        those of the smooth loop: converters without rounding, limits with round corners.
+        RunResult, whose `status` says what went wrong; nothing is raised inside. Its derivatives
+        are those of the smooth loop: converters without rounding, limits with round corners.
     """
     has_converters = structure.feedback == "sampled" and not structure.is_smooth
     run = _rounded() if has_converters else _run
@@ -378,7 +378,7 @@ def simulate(structure: Structure, case: Case, has_record: bool = False) -> Resu
 
 
 @cache
-def _rounded() -> Callable[..., Result]:
+def _rounded() -> Callable[..., RunResult]:
     """`_run` with the derivatives of the smooth loop."""
     run = jax.custom_jvp(_run, nondiff_argnums=(0, 1))
     run.defjvp(_smooth_tangent)
@@ -387,13 +387,13 @@ def _rounded() -> Callable[..., Result]:
 
 def _smooth_tangent(
     structure: Structure, has_record: bool, primals: tuple[Any, ...], tangents: tuple[Any, ...]
-) -> tuple[Result, Result]:
+) -> tuple[RunResult, RunResult]:
     """Rounding has derivative 0, and a loop closed through it a meaningless one."""
     smooth = partial(_run, structure._replace(is_smooth=True), has_record)
     return _run(structure, has_record, *primals), jax.jvp(smooth, primals, tangents)[1]
 
 
-def _run(structure: Structure, has_record: bool, case: Case) -> Result:
+def _run(structure: Structure, has_record: bool, case: Case) -> RunResult:
     start = begin(structure, case)
 
     def body(state: Any, inputs: Any) -> Any:

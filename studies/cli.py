@@ -8,62 +8,47 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import redirect_stdout
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.table import Table
-from rich.text import Text
 from typer.exceptions import Abort, TyperException
 
-from studies import __version__, documents
-from studies.atlas.commands import add_commands as add_atlas
-from studies.bench.commands import add_commands as add_bench
+from studies import __version__, documents, job
+from studies.atlas.verb import atlas
+from studies.bench.verb import bench
 from studies.cache import KINDS, VARIABLE, Kept, cache_contents, is_shared
-from studies.commission.commands import add_commands as add_commission
+from studies.commands import add_verb
+from studies.commission.verb import commission
 from studies.config import PACKAGE, configure, keep_programs, start
+from studies.console import make_console
 from studies.errors import OWN_WARNINGS, StudyError, printable
-from studies.export.commands import add_commands as add_export
-from studies.fitting.commands import add_commands as add_fit
-from studies.laws.commands import add_commands as add_laws
-from studies.papers.commands import add_commands as add_paper
+from studies.explore import explore
+from studies.export.verb import export
+from studies.fitting.verb import fit
+from studies.laws.verb import compare
+from studies.papers.verb import paper
 from studies.results.document import AsJson, print_document
-from studies.screen.commands import add_commands as add_screen
-from studies.single.commands import add_commands as add_single
-from studies.spillover.commands import add_commands as add_spillover
+from studies.single.verb import modes, plant, simulate
+from studies.spillover.verb import certify
 from studies.sweeps.commands import add_commands as add_sweeps
+from studies.sweeps.verb import sweep
 from studies.threads import COMPILING
-from studies.tuning.commands import add_commands as add_tuning
-from studies.twin.commands import add_commands as add_twin
-from studies.verify.commands import add_commands as add_verify
+from studies.tuning.verb import tune
+from studies.twin.verb import twin
+from studies.verify.verb import verify
 
 app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-#: Width of tables in redirected output; a terminal uses its own width.
-FILE_WIDTH = 240
 if not os.environ.get("COLUMNS", "1").strip("0"):
     del os.environ["COLUMNS"]  # a width of 0 would hide all that is printed
-is_watched = (sys.stdout is not None and sys.stdout.isatty()) or "COLUMNS" in os.environ
-
-
-class SafeConsole(Console):
-    """Prints texts of files, such as titles, without control sequences that they may hold."""
-
-    def render_str(self, text: str, **options: Any) -> Text:
-        return super().render_str(printable(text), **options)
-
-
-console = SafeConsole(
-    highlight=False,
-    markup=False,  # units in brackets are not markup
-    width=None if is_watched else FILE_WIDTH,
-)
+console = make_console()
 
 #: Exit code after Ctrl-C.
 INTERRUPTED = 130
@@ -75,6 +60,7 @@ def main(arguments: list[str] | None = None) -> None:
         sys.stderr = open(os.devnull, "w")  # noqa: SIM115
     os.environ["MPLBACKEND"] = "agg"  # figures go to files; one for windows may be missing here
     keep_programs()
+    job.command = tuple(sys.argv[1:] if arguments is None else arguments)
     if threading.current_thread() is threading.main_thread():  # what batch systems end jobs with
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     if isinstance(sys.stdout, TextIOWrapper):  # what its encoding lacks is shown as an escape
@@ -82,7 +68,7 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         if sys.stdout is None:
             raise StudyError("standard output: closed; send it to a file or to /dev/null")
-        _check_text(sys.argv[1:] if arguments is None else arguments)
+        _check_text(job.command)
         output: Any = _Output(sys.stdout)
         with warnings.catch_warnings(), redirect_stdout(output):
             warnings.showwarning = _show_each_once()
@@ -142,7 +128,7 @@ def _is_compiling() -> bool:
     return any(thread.name.startswith(COMPILING) for thread in threading.enumerate())
 
 
-def _check_text(arguments: list[str]) -> None:
+def _check_text(arguments: Iterable[str]) -> None:
     """Raise StudyError for names that are no UTF-8, which no report could print."""
     for argument in arguments:
         try:
@@ -204,30 +190,40 @@ def prepare(
             extend(module)
 
 
-for add_commands in (
-    add_paper,
-    add_single,
-    add_verify,
-    add_sweeps,
-    add_screen,
-    add_tuning,
-    add_fit,
-    add_export,
-    add_atlas,
-    add_spillover,
-    add_laws,
-    add_commission,
-    add_twin,
-    add_bench,
-):
-    add_commands(app, console)
+#: Commands with the arguments of the verb, and whether they can compute in single precision.
+VERBS: dict[Callable[..., Any], bool] = {
+    paper: True,
+    simulate: True,
+    modes: False,
+    plant: False,
+    verify: False,
+    sweep: True,
+    tune: False,
+    fit: False,
+    export: False,
+    atlas: False,
+    certify: False,
+    compare: False,
+    commission: False,
+    twin: False,
+    explore: False,
+    bench: True,
+}
+for verb, has_precision in VERBS.items():
+    add_verb(app, console, verb, has_precision)
+add_sweeps(app, console)
 
 
 @app.command()
 def init(
     out: Annotated[Path | None, typer.Argument(help="file to write; default: print")] = None,
     ready: Annotated[
-        str, typer.Option("--from", help="copy the ready-made study, sweep or tuning of this name")
+        str,
+        typer.Option(
+            "--from",
+            help="copy the ready-made study, sweep or tuning of this name; or recover the study of "
+            "a JSON file written by studies export, whose numbers are checked",
+        ),
     ] = "",
     is_whole: Annotated[
         bool, typer.Option("--all", help="write every field with its allowed range")
@@ -235,30 +231,24 @@ def init(
 ) -> None:
     """Write a commented study file to start from, with the default of each field."""
     from studies.study.files import ready_text
-    from studies.study.template import starter_template, study_template, write_text
+    from studies.study.template import check_new, starter_template, study_template, write_text
 
     if ready and is_whole:
         raise StudyError("--all: --from copies a ready-made file; leave one of them out")
-    text = ready_text(ready) if ready else study_template() if is_whole else starter_template()
+    if ready.endswith(".json"):
+        if out is not None:
+            check_new(out)
+        start()
+        from studies.export.document import import_study
+
+        text = study_template(import_study(ready))
+    else:
+        text = ready_text(ready) if ready else study_template() if is_whole else starter_template()
     if out is None:
         print(text, end="")
         return
     write_text(out, text)
     console.print(f"written: {out}", soft_wrap=True)
-
-
-@app.command()
-def explore(
-    folder: Annotated[Path, typer.Argument(help="folder of a sweep, a tuning, a fit or an atlas")],
-    subject_to: Annotated[
-        str, typer.Option(help="condition whose best cases are replayed, too; for sweeps")
-    ] = "",
-) -> None:
-    """Write a page on which all cases can be looked at: brushed plots, tables, motion."""
-    start()
-    from studies.explore import explore_results
-
-    explore_results(folder, console, subject_to)
 
 
 @app.command()

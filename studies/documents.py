@@ -12,20 +12,21 @@ DOCUMENTS = {
     "bench": "bench.run.Benchmark",
     "best": "sweeps.documents.BestCases",
     "cache": "cache.CacheContents",
+    "certify": "spillover.certificate.Certificate",
     "commission": "commission.findings.CommissionFindings",
+    "compare": "laws.document.LawsDocument",
     "comparison": "export.comparison.ComparedVariants",
     "fit": "fitting.document.FitDocument",
     "info": "config.CurrentSettings",
-    "laws": "laws.document.LawsDocument",
     "modes": "engine.modes.NamedModes",
     "paper": "papers.card.PaperOutcome",
     "sensitivity": "sweeps.documents.Sensitivity",
     "show": "sweeps.documents.Overview",
     "simulate": "single.documents.RunDocument",
-    "spillover": "spillover.certificate.Certificate",
+    "summary": "result.Summary",
     "sweep": "sweeps.dry_run.PlanDocument",
     "twin": "twin.say.TwinDocument",
-    "verify": "verify.run.ModelVerification",
+    "verify": "verify.result.ModelVerification",
 }
 
 
@@ -34,7 +35,8 @@ def schema(command: str) -> dict[str, Any]:
 
     Args:
         command: such as "best"; "sweep" is the plan of `studies sweep --dry-run --json`,
-            "spillover" and "fit" are `certificate.json` and `fit.json`.
+            "certify" and "fit" are also `certificate.json` and `fit.json`; "summary" is of commands
+            without a document of their own.
 
     Raises:
         StudyError: a command without one.

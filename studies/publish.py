@@ -12,11 +12,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from importlib import import_module
 from pathlib import Path
-from typing import Any
-
-from rich.console import Console
 
 from studies.errors import StudyError
 
@@ -213,11 +209,6 @@ def _place(name: str) -> tuple[int, str]:
     return (1 + _LAST.index(suffix) if suffix in _LAST else 0), name
 
 
-def announce(console: Console, report: Path, more: str = "") -> None:
-    """Print where a report is, and what else there is."""
-    console.print(f"report: {report}{more}", soft_wrap=True)
-
-
 def _is_alive(process: str) -> bool:
     """Whether a process of that number runs on this machine."""
     try:
@@ -227,12 +218,3 @@ def _is_alive(process: str) -> bool:
     except (ValueError, OSError, OverflowError):
         return False
     return True
-
-
-def shown(result: Any) -> str:
-    """A result as a notebook shows it, HTML.
-
-    Made by a module found by name: it knows all results, which do not need it, and only a notebook
-    loads it.
-    """
-    return str(import_module("studies.cards").card(result))

@@ -5,8 +5,8 @@ from closed forms and codes of such links. `tests/jaxmodel/test_stretch.py` has 
 """
 
 from jaxmodel.mechanisms import MECHANISMS
-from studies.bench.works import BARE
 from studies.fitting import spec as fitting_spec
+from studies.reference.tables import BARE
 from studies.space import spec as space_spec
 from studies.study import spec
 from studies.study.spec import Study

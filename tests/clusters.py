@@ -13,7 +13,7 @@ import psutil
 
 import studies
 from jaxmodel import status
-from studies.cluster.connect import Workers, connected
+from studies.cluster.connect import connected
 from studies.screen.shards import axis_columns
 from studies.screen.tally import tally_of
 
@@ -23,7 +23,7 @@ PRELOAD = """
 import json, os, time
 from pathlib import Path
 from studies import config
-from studies.cluster import worker
+from studies.cluster import remote, runner
 from studies.engine import plan
 from studies.screen import workers
 from tests.clusters import judged
@@ -32,7 +32,7 @@ plan.LANES, plan.LARGEST_CHUNK = 8, 16
 config.keep_programs()
 trouble = Path(os.environ["TROUBLE"])
 # this file may be run twice
-start, identity = worker.__dict__.setdefault("plain", (worker.start_chunk, worker.identity))
+start, identity = runner.__dict__.setdefault("plain", (runner.start_chunk, remote.identity))
 run = workers.__dict__.setdefault("plain", workers.shard_tally)
 
 def started(executor, table, rows, *more):
@@ -49,9 +49,11 @@ def started(executor, table, rows, *more):
 def tallied(*shard):
     return judged(*shard) if json.loads(trouble.read_text()).get("judged") else run(*shard)
 
-worker.start_chunk = started
+runner.start_chunk = started
 workers.shard_tally = tallied
-worker.identity = lambda: identity() | json.loads(trouble.read_text()).get("identity", {})
+remote.identity = lambda *modules: identity(*modules) | json.loads(trouble.read_text()).get(
+    "identity", {}
+)
 """
 
 
@@ -129,14 +131,14 @@ class Machines:
 
 @contextmanager
 def machines(folder, workers=2, **options):
-    """A scheduler with workers, and a client of them."""
+    """A scheduler with workers, and calls of them."""
     found = Machines(folder, **options)
     try:
         for _ in range(workers):
             found.add_worker()
-        with connected(Workers(str(found.scheduler), None, 60.0), print) as client:
-            client.wait_for_workers(workers, timeout=120)
-            found.client = client
+        with connected(str(found.scheduler), 60.0, print) as remote:
+            remote.client.wait_for_workers(workers, timeout=120)
+            found.remote = remote
             yield found
     finally:
         found.stop()

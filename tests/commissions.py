@@ -15,8 +15,8 @@ from studies.export.run import DAC_BITS
 from studies.fitting.measurements import make_bench, make_measurements
 from studies.study.cases import build_case, build_structure
 from studies.study.signals import INPUTS, OUTPUTS, parse_signal
-from studies.tuning.run import run_tuning
 from studies.tuning.spec import parse_tuning
+from studies.tuning.verb import tune
 from tests.bare import paper_study, parse_fit, parse_study
 from tests.elements import response_of_elements
 from tests.fits import write
@@ -161,10 +161,10 @@ def residual_on(true, tuned):
     return float(np.max(run.result.metrics.residual_rms))
 
 
-def tuned_on(true, measured, folder, console):
+def tuned_on(true, measured, folder):
     """What the same tuning finds for the true machine, with no reserve of margin."""
     motion = find_motion(true).study
     section = tuning_section(measured, motion, {})
     section["limits"]["gain_margin"] = measured.commission.gain_margin
-    run_tuning(parse_tuning(motion.model_dump() | {"tune": section}), folder, console=console)
+    tune(parse_tuning(motion.model_dump() | {"tune": section}), folder, progress=False)
     return with_own_motion(load_design(folder).study, true)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from studies.fitting.estimate import estimate, fit_phases
 from studies.fitting.kinds.modes import TWO_PI
 from studies.fitting.kinds.motions import Recording
 from studies.fitting.measurements import guess, make_bench, make_measurements
@@ -9,6 +10,7 @@ from studies.fitting.problem import make_problem
 from studies.fitting.solve import descend
 from studies.fitting.statistics import describe_fit
 from tests.bare import parse_fit
+from tests.jobs import quiet_job
 
 SHORT = {
     "run": {"duration": 0.06},
@@ -126,6 +128,11 @@ class Ringing:
             steps = values + 1j * TINY_STEP * np.diag(values)
             slope = np.stack([value(x).imag for x in steps], axis=1) / (TINY_STEP * values)
         return Recording(time, 0.03, value(values), slope)
+
+
+def fit_of(spec):
+    """A fit that is not written."""
+    return estimate(spec, quiet_job(None, fit_phases(spec)))
 
 
 def write(folder, name, **columns):

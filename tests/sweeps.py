@@ -7,7 +7,9 @@ from contextlib import contextmanager
 import numpy as np
 
 from studies.engine import plan
+from studies.job import working
 from studies.screen import shards
+from studies.sweeps.run import sweep_phases, swept_into
 from tests.bare import bare, parse_sweep
 
 HOME_PHI = float(np.pi / 6)
@@ -39,6 +41,12 @@ def small(sweep=MIXED, **sections):
 
 def small_spec(sweep=MIXED, **sections):
     return parse_sweep(small(sweep, **sections))
+
+
+def run_sweep(spec, out, resume=False, **options):
+    """A sweep in a folder, quietly; options: as in `swept_into`."""
+    with working("sweep", out, None, sweep_phases(spec), resume, progress=False) as job:
+        return swept_into(spec, job, **options)
 
 
 @contextmanager

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -16,11 +17,11 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from jaxmodel.metrics import METRICS
-from studies.cli import app
+from studies.cli import VERBS, app
 from studies.commission.spec import Commission
 from studies.documents import DOCUMENTS, schema
 from studies.fitting.spec import ENTRIES, Fit, Next
-from studies.space.spec import Block, Screen, Sweep
+from studies.space.spec import Block, Sweep
 from studies.study.explain import allowed_values, unit_of
 from studies.study.spec import OWN_FIELDS, Study
 from studies.study.template import toml_value
@@ -61,12 +62,16 @@ def _argument(parameter: Any) -> str:
     return name if parameter.required else f"[{name}]"
 
 
+def _flags(parameter: Any) -> str:
+    return " / ".join([parameter.opts[0], *parameter.secondary_opts])
+
+
 def _options(command: Any) -> str:
     return table(
         ("argument, option", "value", "meaning", "default"),
         (
             (
-                f"`{_argument(x) if x.param_type_name == 'argument' else x.opts[0]}`",
+                f"`{_argument(x) if x.param_type_name == 'argument' else _flags(x)}`",
                 _value(x),
                 x.help or "",
                 _default_of_option(x),
@@ -95,6 +100,19 @@ def _default_of_option(parameter: Any) -> str:
     return "" if is_left_out else f"`{parameter.default}`"
 
 
+def verbs_text() -> str:
+    """Every verb of Python with the command that is made from it."""
+    rows = ((f"`{verb.__name__}`", f"`studies.{_call(verb)}`") for verb in VERBS)
+    return table(("command", "verb"), rows)
+
+
+def _call(verb: Callable[..., Any]) -> str:
+    """A verb with its arguments and their defaults, and what it returns."""
+    words = inspect.signature(verb)
+    given = [x.replace(annotation=inspect.Parameter.empty) for x in words.parameters.values()]
+    return f"{verb.__name__}{words.replace(parameters=given)}"
+
+
 # fields
 
 
@@ -110,7 +128,6 @@ def fields_text() -> str:
         "## A sweep",
         _section_text("[sweep] and [[sweep.blocks]]", Block),
         _section_text("[sweep]", Sweep, own),
-        _section_text("[sweep.screen]", Screen),
         "## A tuning",
         _section_text("[tune]", Tune),
         _section_text("[tune.scenarios]", Scenarios),
@@ -236,6 +253,7 @@ TEXTS: dict[str, Callable[[], str]] = {
     "fields": fields_text,
     "metrics": metrics_text,
     "results": results_text,
+    "verbs": verbs_text,
 }
 MARK = re.compile(r"<!-- generated: (\w+) -->\n.*?<!-- end -->", re.DOTALL)
 

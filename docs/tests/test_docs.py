@@ -16,9 +16,7 @@ from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
 from jaxmodel.metrics import METRICS
 from studies.cli import app
-from studies.single.run import write_results
-from studies.space.spec import parse_sweep
-from studies.study.spec import Section, Study, parse_study
+from studies.study.spec import Section, Study
 from studies.tuning.spec import load_tuning
 from tests.documents import NOTEBOOKS, PAGES, TOP, blocks, page
 
@@ -74,9 +72,9 @@ def test_the_command_reference_has_every_command():
     assert len(COMMAND.commands) > 15
     for name, command in COMMAND.commands.items():
         (part,) = re.findall(rf"^## studies {name}\n(.*?)(?=^## )", text, re.DOTALL | re.MULTILINE)
-        words = [x.opts[0] for x in command.params if x.param_type_name == "option"]
+        given = [x for x in command.params if x.param_type_name == "option"]
+        words = [" / ".join((*x.opts, *x.secondary_opts)) for x in given]
         assert command.help in part and [x for x in words if f"`{x}`" not in part] == []
-        assert re.search(rf"`(studies )?{name}[ `]", page("docs/reference/commands.md")), name
 
 
 def test_every_metric_is_listed():
@@ -90,7 +88,7 @@ def test_every_reference_has_its_place():
     assert sorted(marks) == sorted(reference.TEXTS)
 
 
-@pytest.mark.parametrize("name", ["commands", "fields", "results"])
+@pytest.mark.parametrize("name", ["commands", "fields", "python", "results"])
 def test_the_reference_is_current(name):
     text = page(f"docs/reference/{name}.md")
     assert text == reference.filled(text), "run: make reference"
@@ -219,7 +217,7 @@ SHORT = {
 
 def swept(axes, folder):
     """Run a sweep of the short move into a folder."""
-    studies.run_sweep(parse_sweep({**SHORT, "sweep": {"axes": axes}}), folder, is_quiet=True)
+    studies.sweep(studies.load({**SHORT, "sweep": {"axes": axes}}), folder, progress=False)
 
 
 def run_block(name, where):
@@ -231,8 +229,7 @@ def run_block(name, where):
 
 def test_the_code_of_the_start_page_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    run = studies.run_study(parse_study(SHORT), has_loop=False)
-    write_results(tmp_path / "run.h5", run, has_report=False)
+    studies.simulate(studies.load(SHORT), tmp_path / "run.h5")
     run_block("docs/index.md", HERE)
 
 
@@ -271,7 +268,8 @@ def test_commands_of_the_documents_exist_with_their_options():
     assert len(lines) > 25
     for path, words in lines:
         words = words[2:] if words[0] == "--with" else words
-        options = {x for one in COMMAND.commands[words[0]].params for x in one.opts}
+        params = COMMAND.commands[words[0]].params
+        options = {x for one in params for x in (*one.opts, *one.secondary_opts)}
         used = {x.partition("=")[0] for x in words if x.startswith("--")}
         assert used <= options, (path, words)
 

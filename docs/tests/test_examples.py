@@ -51,11 +51,8 @@ def in_toml(text):
 #: Calls that only make studies; nothing else of an example is evaluated.
 MAKERS = (
     "Study",
-    "paper_study",
     "change",
-    "parse_study",
-    "parse_sweep",
-    "parse_tuning",
+    "load",
 )
 
 
@@ -79,10 +76,7 @@ def start_names():
     """What makers are called; a sweep or a tuning is its study here, so that nothing starts JAX."""
     makers = SimpleNamespace(
         Study=Study,
-        paper_study=paper_study,
-        parse_sweep=study_of,
-        parse_study=study_of,
-        parse_tuning=study_of,
+        load=lambda what: paper_study() if what == "paper" else study_of(what),
     )
     return {"studies": makers}
 

@@ -4,8 +4,8 @@
 `attribution` turns their residuals into effects, interactions and Shapley shares. `workspace`
 computes natural modes on a grid of poses, `platform` splits the platform's error and computes
 frequency responses. `claims` checks the paper's statements against these results. `findings`
-collects everything; `plots`, `drawing` and `figures` show it, `report` writes the report, and `run`
-is `studies atlas`.
+collects everything; `plots`, `drawing` and `figures` show it, `say` tells it, and `run` writes it;
+`verb` is `studies.atlas`.
 """
 
 import lazy_loader

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from studies.engine.folder import ATLASES
 from studies.explorer.table import ExplorerTable
 from studies.sweeps.explore import explore_sweep
 
 
 def explore_atlas(folder: Path, on_progress: Callable[[int, int], None]) -> ExplorerTable:
     """All runs of an atlas, arguments and errors as `explore_sweep`."""
-    return explore_sweep(folder / ATLASES.mark, on_progress)
+    return explore_sweep(folder / "runs", on_progress)

@@ -7,9 +7,10 @@ import numpy as np
 from studies.atlas.platform import PlatformError, Responses, platform_error, responses
 from studies.atlas.subsets import Subsets, beyond_first, setting_label
 from studies.atlas.workspace import Map, PoseModes, map_workspace, natural_modes_at
-from studies.engine.batches import ProgressCallback
 from studies.engine.frame import frame_of
 from studies.engine.preflight import check_run
+from studies.job import Job
+from studies.result import Result
 from studies.results.labelled import Labelled, derived, labelled, told, unwritten
 from studies.study.labels import POSE_UNITS
 from studies.study.spec import Study
@@ -22,7 +23,7 @@ FREQUENCY = np.linspace(2.0, 600.0, 300)
 _ROUND = np.linspace(-3.0, 3.0, 13)
 
 
-class AtlasFindings(Labelled):
+class AtlasFindings(Labelled, Result):
     """What the atlas found."""
 
     study: Study = unwritten()
@@ -37,6 +38,9 @@ class AtlasFindings(Labelled):
     )
     modes: PoseModes = unwritten()  # at these poses
     adc_step: np.ndarray = unwritten()  # of one ADC step, in the deflection of mode 1 [m], (3,)
+    dropped: tuple[str, ...] = unwritten()  # settings left out, and why
+
+    FILES = ", data, figures and animation in the same folder"
 
     @derived("Hz", "at these poses", "mode_pose", "natural_mode")
     def mode_frequency(self) -> np.ndarray:
@@ -80,7 +84,11 @@ def adc_step(study: Study) -> np.ndarray:
 
 
 def evaluate_atlas(
-    study: Study, choices: Subsets, subsets: Subsets | None, on_progress: ProgressCallback
+    study: Study,
+    choices: Subsets,
+    subsets: Subsets | None,
+    dropped: list[str],
+    job: Job,
 ) -> AtlasFindings:
     """All of the atlas except the runs of the subsets.
 
@@ -88,17 +96,18 @@ def evaluate_atlas(
         study: the design.
         choices: of links, from `read_subsets`.
         subsets: of modes; None where they do not matter.
-        on_progress: called with progress messages.
+        dropped: settings left out, and why.
+        job: whose phase says what is done.
 
     Raises:
         StudyError: as `check_run`.
     """
-    runs = platform_error(study, on_progress)
-    on_progress("frequency responses", 0.0)
+    runs = job.part("platform", lambda: platform_error(study, job.say))
+    job.say("frequency responses")
     own = natural_modes_at(study, [study.motion.waypoints[0]]).frequency[0]
-    linear = responses(study, _frequencies(study, own))
-    on_progress("natural modes over the workspace", 0.0)
-    chart = map_workspace(study)
+    linear = job.part("responses", lambda: responses(study, _frequencies(study, own)))
+    job.say("natural modes over the workspace")
+    chart = job.part("workspace", lambda: map_workspace(study))
     poses = np.stack([np.array(study.motion.waypoints[0]), _far_pose(chart)])
     modes = natural_modes_at(study, poses)
     return AtlasFindings(
@@ -111,6 +120,7 @@ def evaluate_atlas(
         poses=poses,
         modes=modes,
         adc_step=adc_step(study),
+        dropped=tuple(dropped),
     )
 
 

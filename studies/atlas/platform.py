@@ -6,7 +6,7 @@ flexible machine's error is vibration error (the paper's figures 5, 6, 8, 10 sho
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -87,30 +87,29 @@ class PlatformError(Labelled):
         return np.sqrt(total / count)
 
 
-def platform_error(study: Study, on_progress: Any = None) -> PlatformError:
+def platform_error(study: Study, say: Callable[[str], object] = lambda _: None) -> PlatformError:
     """Run the paper's choices of links, and the machine with rigid links, with trajectories.
 
     Args:
         study: the design; move time, shaper and links are replaced.
-        on_progress: called with the current step and the share of the work since the last call.
+        say: called with what is done next.
 
     Raises:
         StudyError: as `check_run`.
     """
-    on_progress = on_progress or (lambda text, share: None)
     study = long_enough(study, SETTINGS)
     moved = [study.change(motion__move_time=t, shaper__kind=kind) for t, kind in SETTINGS]
     built = [check_run(one) for one in moved]
     structure = built[0][0]._replace(substeps=max(x.substeps for x, _ in built))
     first = [x for _, case in built for x in (_with_links(case, LINK_SETS[0]), _rigid(case))]
-    quiet = run_batches(structure, first, on_progress)
+    quiet = run_batches(structure, first, say)
     cases = []
     for k, (_, case) in enumerate(built):
         if study.control.ratio_source == "own_run":
             own = signed_power(quiet.metrics.energy_ratio[2 * k], study.control.ratio_exponent)
             case = with_ratio(case, own)
         cases += [_with_links(case, links) for links in LINK_SETS[1:]]
-    active = run_batches(structure, cases, on_progress)
+    active = run_batches(structure, cases, say)
     assert quiet.record is not None and active.record is not None
     count = len(SETTINGS)
 

@@ -6,13 +6,11 @@ where modes 2 and up matter.
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from jaxmodel import status
-from studies import config
 from studies.atlas.attribution import interaction, shapley
 from studies.atlas.figures import write_animation
 from studies.atlas.findings import AtlasFindings, adc_step, evaluate_atlas
@@ -32,116 +30,70 @@ from studies.atlas.subsets import (
     subset_label,
 )
 from studies.engine.columns import axis_variables, named
-from studies.engine.folder import ATLASES, locked_folder, refuse_existing
-from studies.engine.progress import Phases
 from studies.engine.run_data import run_attributes
 from studies.errors import StudyError
+from studies.job import Job
 from studies.publish import publish
+from studies.result import in_folder
 from studies.results.labelled import Variable, Variables, variables
 from studies.show.pages import write_report
-from studies.space.spec import SweepSpec
 from studies.store import axis_sizes, write_store
 from studies.study.spec import Study
-from studies.sweeps.run import run_sweep, sweep_phases
+from studies.sweeps.run import swept_into
 from studies.threads import serial_blas
 
-DATA, RUNS_FOLDER, MODES_FOLDER = "atlas.h5", ATLASES.mark, "runs_modes"
+DATA, RUNS_FOLDER, MODES_FOLDER = "atlas.h5", "runs", "runs_modes"
 #: Figures of subsets of modes.
 OF_MODES = "mode_shares", "interactions"
-#: Phases after those of the sweep.
-LATER = ("analyse", "draw")
+#: Modules that determine the numbers, with everything they import.
+DECISIVE = ("studies.atlas.findings", "studies.atlas.subsets", "studies.engine.plan")
 
 
-def run_atlas(
-    study: Study,
-    out: str | Path,
-    is_resumed: bool = False,
-    console: Console | None = None,
-    is_quiet: bool = False,
-    has_pdf: bool = False,
-) -> bool:
+#: What is done, with what it takes on two cores [s].
+PHASES = {"compile": 60.0, "run": 60.0, "join": 5.0, "analyse": 60.0, "draw": 30.0}
+
+
+def mapped(study: Study, job: Job, has_pdf: bool = False) -> AtlasFindings:
     """Run all subsets of a design, analyse its workspace and platform, and write the report.
 
     Args:
         study: the design.
-        out: folder.
-        is_resumed: continue with existing runs; everything else is computed anew.
-        console: where progress goes; default: standard output.
-        is_quiet: hide progress.
+        job: with `PHASES`.
         has_pdf: also write the figures as PDF.
 
-    Returns:
-        Whether it finished; if not, Ctrl-C ended it, and finished runs are kept.
-
     Raises:
-        StudyError: a fault of the design or the folder; no setting in which all cases finish.
+        StudyError: a fault of the design; no setting in which all cases finish.
     """
-    config.require_configured()
-    out, console = Path(out), console or Console(highlight=False, markup=False)
-    spec = atlas_sweep(study)
-    with locked_folder(out, "atlas"):
-        refuse_existing(out, ATLASES, is_resumed)
-        with Phases(console, (*sweep_phases(spec), *LATER), is_quiet) as phases:
-            try:
-                _run(study, spec, out, is_resumed, phases, has_pdf)
-            except KeyboardInterrupt:
-                return False
-    return True
-
-
-def _run(
-    study: Study, spec: SweepSpec, out: Path, is_resumed: bool, phases: Phases, has_pdf: bool
-) -> None:
-    """All of the atlas in an open folder; arguments as in `run_atlas`, and the sweep of links.
-
-    Raises:
-        KeyboardInterrupt: also where a sweep was interrupted.
-        StudyError: as `run_atlas`.
-    """
-    if run_sweep(spec, out / RUNS_FOLDER, is_resumed, phases=phases).is_interrupted:
-        raise KeyboardInterrupt
-    choices, dropped = sound_settings(read_subsets(out / RUNS_FOLDER))
+    choices, dropped = _swept(study, job, RUNS_FOLDER)
     if not choices.setting:
         raise StudyError(f"atlas: no setting in which all cases run; {' '.join(dropped)}")
     changes = beyond_first(choices, adc_step(study))
     matter = tuple(choices.setting[k] for k in np.flatnonzero(changes > MATTERS))
-    phases.say(
+    job.say(
         f"modes 2 and up change the residual by {100 * changes.max():.2g} % of its mean square at "
         f"most: all subsets of modes in {len(matter)} of {len(changes)} settings"
     )
     subsets = None
     if matter:
-        every = atlas_sweep(study, settings=matter, has_every_mode=True)
-        if run_sweep(every, out / MODES_FOLDER, is_resumed, phases=phases).is_interrupted:
-            raise KeyboardInterrupt
-        subsets, more = sound_settings(read_subsets(out / MODES_FOLDER, has_every_mode=True))
-        dropped += more
-        subsets = subsets if subsets.setting else None
-    _finish(study, (choices, subsets), dropped, out, phases, has_pdf)
-
-
-def _finish(
-    study: Study,
-    found: tuple[Subsets, Subsets | None],
-    dropped: list[str],
-    out: Path,
-    phases: Phases,
-    has_pdf: bool,
-) -> None:
-    """Everything after the sweeps; found: choices of links, subsets of modes."""
-
-    def on_progress(text: str, share: float) -> None:
-        if share == 0:  # the beginning of a step; its end needs no message
-            phases.say(text)
-
-    phases.begin("analyse")
+        every, more = _swept(study, job, MODES_FOLDER, settings=matter, has_every_mode=True)
+        subsets, dropped = every if every.setting else None, dropped + more
+    job.begin("analyse")
     with serial_blas():
-        findings = evaluate_atlas(study, *found, on_progress)
-    phases.begin("draw")
-    with publish(out, [f"{x}.{kind}" for x in OF_MODES for kind in ("png", "pdf")]) as staging:
-        write_store(staging / DATA, atlas_variables(findings), run_attributes(study))
-        write_animation(findings, staging)
-        write_report(say(findings, dropped), staging, has_pdf)
+        found = evaluate_atlas(study, choices, subsets, dropped, job)
+    job.begin("draw")
+    of_modes = [f"{x}.{kind}" for x in OF_MODES for kind in ("png", "pdf")]
+    with publish(job.place, of_modes) as staging:
+        write_store(staging / DATA, atlas_variables(found), run_attributes(study))
+        write_animation(found, staging)
+        write_report(say(found), staging, has_pdf)
+    return in_folder(found, job.place)
+
+
+def _swept(study: Study, job: Job, name: str, **which: Any) -> tuple[Subsets, list[str]]:
+    """Subsets of a design in all settings in which every case finished; what is wrong elsewhere."""
+    with job.inside(name) as runs:
+        swept_into(atlas_sweep(study, **which), runs)
+        return sound_settings(read_subsets(runs.place, which.get("has_every_mode", False)))
 
 
 def sound_settings(subsets: Subsets) -> tuple[Subsets, list[str]]:

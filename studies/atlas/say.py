@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -23,8 +23,8 @@ from studies.study.window import residual_delay
 ALL_LINKS, PLATFORM = TARGETS.index("all links"), TARGETS.index("platform")
 
 
-def say(findings: AtlasFindings, dropped: Sequence[str] = ()) -> Report:
-    """What an atlas tells; dropped: settings left out, and why."""
+def say(findings: AtlasFindings) -> Report:
+    """What an atlas tells."""
     study, count = findings.study, len(findings.choices.setting)
     is_stable = findings.responses.is_stable.all()
     modes = findings.choices.modes
@@ -39,13 +39,13 @@ def say(findings: AtlasFindings, dropped: Sequence[str] = ()) -> Report:
         result=[
             *_most_vibration(findings),
             "" if is_stable else "**The linearised loop is unstable: these are limit cycles.**",
-            *(f"**Left out:** {text}" for text in dropped),
+            *(f"**Left out:** {text}" for text in findings.dropped),
         ],
         question=f"""{study.title}: which of the three links are worth controlling, which links help
         or hurt each other, and whether the paper's statements hold: the 8 choices of controlled
         links in {count_text(count, "setting")}{subsets}.""",
         next_steps=f"""control the links with the largest shares below; `studies sweep links` covers
-        fewer choices in more settings, `studies spillover DESIGN --out DIR` shows how far to trust
+        fewer choices in more settings, `studies certify DESIGN --out DIR` shows how far to trust
         the design.{excite if modes > 1 and not subsets else ""}""",
         top=[machine(study)],
         chapters=[

@@ -11,23 +11,24 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from rich.console import Console
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.metrics import METRICS as ALL
-from jaxmodel.simulate import Result
+from jaxmodel.simulate import RunResult
 from studies import config
 from studies.engine.executor import Executor
 from studies.engine.function import STEPPERS
 from studies.engine.plan import Layout, even_layout, most_lanes, peak_memory
 from studies.engine.results import read_sweep
 from studies.errors import StudyError, field_error
+from studies.job import working
 from studies.kernels.compilation import compiler_time
 from studies.kernels.llvm import is_available
+from studies.reference.tables import BARE
 from studies.space.spec import parse_sweep
 from studies.study.cases import build_cases, build_structure, in_working_precision
 from studies.study.spec import paper_study
-from studies.sweeps.run import run_sweep
+from studies.sweeps.run import sweep_phases, swept_into
 
 #: A sweep of very short runs: ten samples of a released link, so that the engine itself is timed.
 SHORT_RUNS: dict[str, Any] = {
@@ -51,13 +52,6 @@ SHORT_RUNS: dict[str, Any] = {
 }
 
 
-#: Bare links of given length under half the paper's gains, as the workloads have them.
-BARE: dict[str, Any] = {
-    "link__basis": "pinned_pinned",
-    "link__stretch": False,
-    "control__basis": "pinned_pinned",
-    "control__velocity_gain": (1.55, 1.75, 1.7),
-}
 #: Workloads of closed-loop runs, 0.8 s at 10 kHz, by their differences from the paper's study.
 WORKS: dict[str, dict[str, Any]] = {
     # PD drive, ideal modal velocity feedback, unshaped square, residual rms only
@@ -202,7 +196,9 @@ def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
     return figures
 
 
-def _errors(result: Result, structure: Structure, layout: Layout, cases: Case) -> dict[str, float]:
+def _errors(
+    result: RunResult, structure: Structure, layout: Layout, cases: Case
+) -> dict[str, float]:
     """Largest error of each metric against double precision, relative to its largest value."""
     jax.config.update("jax_enable_x64", True)  # for all threads, unlike jax.enable_x64
     try:
@@ -216,17 +212,18 @@ def _errors(result: Result, structure: Structure, layout: Layout, cases: Case) -
     }
 
 
-def bench_sweep(cases: int, console: Console) -> dict[str, Any]:
+def bench_sweep(cases: int) -> dict[str, Any]:
     """Time and peak memory of a sweep of very short runs, chunk files and joining included.
 
     Args:
         cases: how many.
-        console: where progress goes.
     """
     data = SHORT_RUNS | {"sweep": SHORT_RUNS["sweep"] | {"count": cases}}
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "sweep"
-        result = run_sweep(parse_sweep(data), out, console=console)
+        spec = parse_sweep(data)
+        with working("sweep", out, None, sweep_phases(spec), progress=False) as job:
+            result = swept_into(spec, job)
         size = sum(file.stat().st_size for file in out.rglob("*.h5"))
         rms = read_sweep(out)["residual_rms"]
     return {

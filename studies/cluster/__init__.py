@@ -1,8 +1,7 @@
-"""Sweeps and tunings on the workers of a Dask cluster (extra `cluster`).
+"""Work on a Dask cluster (extra `cluster`): functions of plain arguments, called on its workers.
 
 `connect` joins a scheduler, or starts workers on this machine, and rejects workers with other
-versions; `runner` distributes the chunks of a sweep and collects them, whatever happens to the
-workers; `worker` is the code that runs there: pure functions that need no files;
-`studies.tuning.workers` does the same for the designs of a tuning. Only the client writes
-results.
+versions; `remote` calls functions there, whatever happens to the workers, which `watch` restarts if
+they hang; `runner` does so with the chunks of a sweep. Functions need no files: only the client
+writes results.
 """

@@ -14,12 +14,9 @@ from importlib.util import find_spec
 from ipaddress import ip_address
 from multiprocessing import current_process, resource_tracker
 from pathlib import Path
-from shlex import quote
-from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any
 
-import typer
-
-from studies.cluster.watch import GONE, wait_for_workers
+from studies.cluster.watch import GONE
 from studies.config import processor, usable_cores
 from studies.errors import StudyError, field_error
 from studies.reading import read_json
@@ -27,145 +24,134 @@ from studies.reading import read_json
 if TYPE_CHECKING:
     from distributed import Client
 
+    from studies.cluster.remote import Remote
 
-T = TypeVar("T")
-
-#: Options of the commands that can use workers.
-Scheduler = Annotated[str | None, typer.Option(help="Dask cluster: tcp://HOST:PORT, or its file")]
-
-
-LocalWorkers = Annotated[int | None, typer.Option(help="run in this many processes here")]
-
-
-WorkerTimeout = Annotated[float, typer.Option(help="restart workers silent for so long [s]")]
-
-
-#: Default of `WorkerTimeout` [s].
+#: Workers as users name them: a number of processes on this machine, a scheduler's address
+#: (tcp://..., tls://...) or its file (JSON); None: all cores where that is worth their start,
+#: otherwise this process.
+Place = int | str | Path | None
+#: Workers silent for so long are restarted by default [s].
 TIMEOUT = 600.0
 #: On so many cores, processes with two of them each are faster than one process: in that, threads
 #: of XLA wait for each other (docs/performance.md).
 MANY = 16
 #: Time limit for the scheduler to answer [s].
 PATIENCE = 15
+#: That for the first worker to join [s].
+WORKER_PATIENCE = 300
 #: That for all workers to tell their versions, which computing does not delay [s].
 ANSWER_TIME = 60
 
 
-class Workers(NamedTuple):
-    """Where to run."""
+def parse_workers(workers: Place) -> int | str | None:
+    """A number of processes, or a scheduler's address or file; None if none are named.
 
-    scheduler: str | None = None  # address (tcp://..., tls://...) or the scheduler's file (JSON)
-    local: int | None = None  # or how many processes to start on this machine
-    timeout: float = TIMEOUT  # a worker busy for longer without an answer is restarted [s]
-
-    @property
-    def options(self) -> str:
-        """These as command-line options, "" for none."""
-        named: dict[str, object] = {"--scheduler": self.scheduler, "--local-workers": self.local}
-        if self.are_named and self.timeout != TIMEOUT:
-            named["--worker-timeout"] = self.timeout
-        written = ((name, quote(str(value))) for name, value in named.items() if value is not None)
-        return "".join(f" {name} {value}" for name, value in written)
-
-    @property
-    def are_named(self) -> bool:
-        """Whether workers are requested; otherwise this process does the work."""
-        return self.scheduler is not None or self.local is not None
-
-    def with_default(self, is_large: bool, say: Callable[[str], None]) -> Workers:
-        """These; where none are named, for much work, worth the 10 s of their start, all cores."""
-        cores = usable_cores()
-        if self.are_named or cores < MANY or not is_large or processor() != "cpu":
-            return self
-        reason = "" if find_spec("distributed") else "flexlink-studies[cluster] uses all"
-        if reason := reason or _unguarded():
-            say(f"one process uses about four of {cores} cores; {reason}")
-            return self
-        say(f"{cores // 2} processes share {cores} cores; --local-workers 1: one uses about four")
-        return self._replace(local=cores // 2)
+    Raises:
+        StudyError: it is neither.
+    """
+    if workers is None or type(workers) is int:
+        return workers
+    if not isinstance(workers, str | Path):
+        raise field_error(
+            "workers", workers, "a number of processes, a scheduler's address or file"
+        )
+    text = str(workers)
+    return int(text) if re.fullmatch(r"[+-]?\d+", text) else text
 
 
-#: Workers as users name them: a number of processes on this machine, a scheduler's address or file;
-#: None: all cores where that is worth their start, otherwise this process.
-Place = Workers | int | str | Path | None
+def all_cores(say: Callable[[str], None]) -> int | None:
+    """Processes that share many cores, where that can be done, otherwise None."""
+    cores = usable_cores()
+    if cores < MANY or processor() != "cpu":
+        return None
+    reason = "" if find_spec("distributed") else "flexlink-studies[cluster] uses all"
+    if reason := reason or _unguarded():
+        say(f"one process uses about four of {cores} cores; {reason}")
+        return None
+    say(f"{cores // 2} processes share {cores} cores; --workers 1: one uses about four")
+    return cores // 2
 
 
 @contextmanager
 def on_workers(
-    place: Place,
-    is_large: bool,
+    workers: Place,
+    timeout: float,
     say: Callable[[str], None],
-    make: Callable[[Client, float], T],
-    given: T | None = None,
-) -> Iterator[T | None]:
-    """Make something from a client of the workers, None for this process.
+    *functions: Callable[..., Any],
+    is_large: bool = False,
+) -> Iterator[Remote | None]:
+    """Workers, None for this process.
 
     Args:
-        place: which workers.
-        is_large: the work is worth the start of workers that are not asked for.
+        workers: which ones.
+        timeout: one busy for longer without an answer is restarted [s].
         say: called with progress messages.
-        make: called with the client and the workers' time limit [s].
-        given: what to use in place of workers.
+        functions: what they are to run, see `Remote.map`.
+        is_large: the work is worth the 10 s that workers take to start, also if not asked for.
 
     Raises:
         StudyError: as `connected`.
     """
-    if isinstance(place, str | Path):
-        place = Workers(scheduler=str(place))
-    elif place is None or type(place) is int:
-        place = Workers(local=place)
-    elif not isinstance(place, Workers):
-        raise field_error("workers", place, "a number of processes, a scheduler's address or file")
-    workers = place.with_default(is_large and given is None, say)
-    if given is not None or not workers.are_named:
-        yield given
+    named = parse_workers(workers)
+    if named is None and is_large:
+        named = all_cores(say)
+    if named is None:
+        yield None
         return
-    with connected(workers, say) as client:
-        yield make(client, workers.timeout)
+    with connected(named, timeout, say, *functions) as remote:
+        yield remote
 
 
 @contextmanager
-def connected(workers: Workers, on_progress: Callable[[str], None]) -> Iterator[Client]:
-    """A client of a cluster with compatible workers.
+def connected(
+    workers: int | str,
+    timeout: float,
+    say: Callable[[str], None],
+    *functions: Callable[..., Any],
+) -> Iterator[Remote]:
+    """Compatible workers.
 
     Args:
-        workers: which ones.
-        on_progress: called with progress messages.
+        workers: a number of processes, or a scheduler's address or file.
+        timeout, say, functions: as in `on_workers`.
 
     Raises:
         StudyError: no extra `cluster`, no such scheduler, no worker, workers of other versions or
             without an answer, or the scheduler goes meanwhile.
     """
-    option = "--local-workers" if workers.scheduler is None else "--scheduler"
-    if workers.scheduler is not None and workers.local is not None:
-        raise StudyError("--scheduler, --local-workers: name one of them")
-    if not workers.timeout > 0:
-        raise field_error("--worker-timeout", workers.timeout, "more than 0", "s")
+    if not timeout > 0:
+        raise field_error("--worker-timeout", timeout, "more than 0", "s")
     try:
         import distributed  # noqa: F401
     except ImportError:
         raise StudyError(
-            f"{option}: Dask's distributed is missing: install flexlink-studies[cluster]"
+            "--workers: Dask's distributed is missing: install flexlink-studies[cluster]"
         ) from None
     # this package itself reports what users should know
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    cluster = (
-        _local_cluster(workers.local or 0)
-        if workers.scheduler is None
-        else _remote_cluster(workers.scheduler, on_progress)
-    )
+    cluster = _local_cluster(workers) if isinstance(workers, int) else _remote_cluster(workers, say)
     from distributed.comm.core import CommClosedError
+
+    from studies.cluster.remote import Remote
 
     with cluster as client:
         try:
             if not client.ncores():
-                on_progress("waiting for a worker to join")
+                say("waiting for a worker to join")
             wait_for_workers(client)
-            refuse_other_versions(client)
-            yield client
+            refuse_other_versions(client, *functions)
+            yield Remote(client, timeout, say)
         except CommClosedError:  # while workers were waited for, or asked for something
             raise StudyError(GONE) from None
+
+
+def wait_for_workers(client: Client) -> None:
+    """Raise StudyError if no worker joins in time."""
+    try:
+        client.wait_for_workers(1, timeout=WORKER_PATIENCE)
+    except TimeoutError:
+        raise StudyError(f"no worker has joined within {WORKER_PATIENCE} s") from None
 
 
 @contextmanager
@@ -175,10 +161,10 @@ def _remote_cluster(scheduler: str, say: Callable[[str], None]) -> Iterator[Clie
 
     address = scheduler if "://" in scheduler else written_address(scheduler)
     if not re.fullmatch(r"(tcp|tls)://[^/]+:\d+", address):
-        raise field_error("--scheduler", address, "tcp://HOST:PORT or tls://HOST:PORT")
+        raise field_error("--workers", address, "tcp://HOST:PORT or tls://HOST:PORT")
     if address.startswith("tcp://") and not _is_here(address):
         say(
-            f"--scheduler {address}: not encrypted, and whoever reaches that port can run programs "
+            f"--workers {address}: not encrypted, and whoever reaches that port can run programs "
             "here and on the workers; use tls:// unless the network is private "
             "(docs/how-to/cluster.md)"
         )
@@ -186,14 +172,14 @@ def _remote_cluster(scheduler: str, say: Callable[[str], None]) -> Iterator[Clie
     context = Security().get_connection_args("client").get("ssl_context")
     if address.startswith("tls://") and context is None:
         raise StudyError(
-            f"--scheduler {address}: no client certificates; set them for Dask "
+            f"--workers {address}: no client certificates; set them for Dask "
             "(distributed.comm.tls, docs/how-to/cluster.md)"
         )
     try:
         client = Client(address, timeout=PATIENCE, set_as_default=False)
     except (OSError, ValueError, RuntimeError) as error:  # OSError covers timeouts
         reason = str(error).partition("\n")[0] or type(error).__name__
-        raise StudyError(f"--scheduler {scheduler}: no scheduler answers ({reason})") from None
+        raise StudyError(f"--workers {scheduler}: no scheduler answers ({reason})") from None
     with client:
         yield client
 
@@ -213,11 +199,11 @@ def written_address(file: str) -> str:
         address = read_json(Path(file))["address"]
     except FileNotFoundError:
         raise StudyError(
-            f"--scheduler {file}: no such file; allowed: tcp://HOST:PORT, tls://HOST:PORT, or a "
-            "scheduler's JSON file"
+            f"--workers {file}: no such file; allowed: a number of processes, tcp://HOST:PORT, "
+            "tls://HOST:PORT, or a scheduler's JSON file"
         ) from None
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise StudyError(f"--scheduler {file}: not a scheduler's file ({error})") from None
+        raise StudyError(f"--workers {file}: not a scheduler's file ({error})") from None
     return str(address)
 
 
@@ -230,7 +216,7 @@ def _local_cluster(count: int) -> Iterator[Client]:
         sys.exit(1)  # the process that starts it says why
     cores = usable_cores()
     if not 1 <= count <= cores:
-        raise field_error("--local-workers", count, f"1 to {cores}, the cores of this machine")
+        raise field_error("--workers", count, f"1 to {cores}, the cores of this machine")
     options = {
         "nthreads": cores // count,
         "host": "127.0.0.1",
@@ -244,7 +230,7 @@ def _local_cluster(count: int) -> Iterator[Client]:
             cluster = SpecCluster(workers, heart, silence_logs=logging.CRITICAL)
         except (OSError, RuntimeError) as error:  # OSError covers timeouts
             reason = _unguarded() or str(error).partition("\n")[0] or type(error).__name__
-            raise StudyError(f"--local-workers: workers do not start ({reason})") from None
+            raise StudyError(f"--workers: workers do not start ({reason})") from None
     with cluster, Client(cluster, timeout=PATIENCE, set_as_default=False) as client:
         yield client
 
@@ -279,15 +265,16 @@ def _graphics(number: int) -> dict[str, str]:
     return {"CUDA_VISIBLE_DEVICES": devices[number % len(devices)]} if devices else {}
 
 
-def refuse_other_versions(client: Client) -> None:
-    """Raise StudyError if a worker has other versions than this process."""
+def refuse_other_versions(client: Client, *functions: Callable[..., Any]) -> None:
+    """Raise StudyError if a worker has other versions than this process, for these functions."""
     from distributed.comm.core import CommClosedError
 
-    from studies.cluster.worker import difference, identity
+    from studies.cluster.remote import difference, identity
 
-    own, faults = identity(), []
+    modules = [function.__module__ for function in functions]
+    own, faults = identity(*modules), []
     try:
-        answers = client.run(identity, on_error="return", callback_timeout=ANSWER_TIME)
+        answers = client.run(identity, *modules, on_error="return", callback_timeout=ANSWER_TIME)
     except TimeoutError:
         raise StudyError(
             f"a worker has not told its versions within {ANSWER_TIME} s: restart workers that "

@@ -16,18 +16,8 @@ if TYPE_CHECKING:
 GONE = "the scheduler is gone; finished work is safe; continue with --resume"
 #: How often workers are checked [s].
 CHECK_INTERVAL = 1.0
-#: Time limit for the first worker to join [s].
-WORKER_PATIENCE = 300
 #: Time allowed for stopping a worker that hangs [s].
 KILL_TIME = 10
-
-
-def wait_for_workers(client: Client) -> None:
-    """Raise StudyError if no worker joins in time."""
-    try:
-        client.wait_for_workers(1, timeout=WORKER_PATIENCE)
-    except TimeoutError:
-        raise StudyError(f"no worker has joined within {WORKER_PATIENCE} s") from None
 
 
 class Watch:
@@ -36,14 +26,14 @@ class Watch:
     def __init__(self, client: Client, timeout: float, on_progress: Callable[[str], None]) -> None:
         """
         Args:
-            client: from `connected`.
+            client: of the cluster.
             timeout: a worker that stays busy for longer without answering is restarted [s].
             on_progress: called with what users should know.
         """
         self._client, self._timeout, self._on_progress = client, timeout, on_progress
         self._idle: dict[str, float] = {}  # when a worker last had nothing to do, or answered
         self._last_check = 0.0
-        self.n_workers = len(client.ncores())
+        self.n_workers = max(len(client.ncores()), 1)  # the first check says if there are none
 
     def finished(self, pending: Iterable[Future[Any]]) -> list[Future[Any]]:
         """Work that has finished; empty if none finishes for a while."""
@@ -59,15 +49,15 @@ class Watch:
         return [future for future in futures if future.status != "pending"]
 
     def outcome(self, future: Future[Any]) -> Any:
-        """A worker's answer, or a text that says why there is none.
+        """A worker's value, or a text that says why there is none.
 
         Raises:
-            StudyError: the worker rejects the work, or the scheduler is gone.
+            StudyError: that of the work, the worker rejects it, or the scheduler is gone.
         """
         from distributed import KilledWorker
 
         try:
-            answer = future.result()
+            value, address = future.result()
         except StudyError:
             raise
         except KilledWorker:
@@ -77,8 +67,8 @@ class Watch:
                 raise StudyError(GONE) from None
             # from JAX, LLVM, memory, disk: anything can go wrong there
             return f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
-        self._idle[answer.worker] = time.monotonic()
-        return answer
+        self._idle[address] = time.monotonic()
+        return value
 
     def _check_workers(self, keys: set[Any]) -> None:
         now = time.monotonic()

@@ -7,8 +7,8 @@ how sure that is, and what to measure next if it is not.
 - `spec` reads the file; `stages` are fit, tuning, certificate and firmware, each of which reads
   the files of the one before; `machines` judges the chosen controller on every machine that the
   data leave possible.
-- `run` goes from one stage to the next, or refuses; `report` presents it, `commands` is
-  `studies commission`.
+- `run` goes from one stage to the next, or refuses; `say` presents it, `verb` is
+  `studies.commission` and the command.
 """
 
 import lazy_loader

@@ -1,5 +1,5 @@
 from .findings import CommissionFindings
-from .run import run_commission
 from .spec import MeasuredSpec, load_measured
+from .verb import commission
 
-__all__ = ["CommissionFindings", "MeasuredSpec", "load_measured", "run_commission"]
+__all__ = ["CommissionFindings", "MeasuredSpec", "commission", "load_measured"]

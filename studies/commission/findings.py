@@ -10,13 +10,13 @@ import numpy as np
 from studies.commission.spec import MeasuredSpec
 from studies.engine.fast_motion import LEAST_STEPS
 from studies.fitting.spec import shown_unit
-from studies.publish import shown
+from studies.result import Result
 from studies.results.labelled import Labelled, derived, told, unwritten
 from studies.study.margin import margin_text
 from studies.study.spec import Study
 
 
-class CommissionFindings(Labelled, command="commission"):
+class CommissionFindings(Labelled, Result, command="commission"):
     """`commission.json`, by `studies commission`: whether there is firmware, and why not."""
 
     out: Path = unwritten()
@@ -50,9 +50,6 @@ class CommissionFindings(Labelled, command="commission"):
     @derived("", "how many these are")
     def machines(self) -> int:
         return 0 if self.margins is None else len(self.margins)
-
-    def _repr_html_(self) -> str:
-        return shown(self)
 
 
 def found_text(outcome: CommissionFindings) -> str:

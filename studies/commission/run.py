@@ -7,12 +7,9 @@ but the answer must be as it was written (`answers.json`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 
-from studies import config
 from studies.commission.findings import CommissionFindings
 from studies.commission.machines import margins_on
 from studies.commission.say import say
@@ -30,82 +27,53 @@ from studies.commission.stages import (
     price_text,
     tuned_design,
 )
-from studies.engine.folder import (
-    COMMISSIONINGS,
-    keep_request,
-    locked_folder,
-    make_manifest,
-    refuse_existing,
-)
 from studies.errors import StudyError
-from studies.export.firmware.build import check_tools
-from studies.publish import REPORT, announce, publish, replacing
+from studies.job import Job
+from studies.publish import publish
+from studies.result import in_folder
 from studies.results.document import json_text
 from studies.show.pages import write_report
-from studies.show.report import print_result
 
-DOCUMENT, MARGINS = "commission.json", "margins.npy"
+DOCUMENT = "commission.json"
+#: What is done, with what it takes on two cores [s].
+PHASES = {"fit": 60.0, "tune": 240.0, "certificate": 30.0, "firmware": 60.0}
 #: Modules that determine the numbers, with everything they import.
 DECISIVE = ("studies.commission.stages", "studies.commission.machines")
 
 
-def run_commission(
-    measured: MeasuredSpec,
-    out: str | Path,
-    is_resumed: bool = False,
-    console: Console | None = None,
-) -> CommissionFindings:
-    """Lead from measurements to verified firmware, or refuse and say what is missing.
+def commissioned(measured: MeasuredSpec, job: Job) -> CommissionFindings:
+    """All stages, up to the first one whose answer does not support the next.
 
     Args:
-        measured: from `load_measured`.
-        out: folder; each stage has one of its own in it.
-        is_resumed: go on with an interrupted commissioning.
-        console: where messages go; default: standard output.
+        measured: what was asked for.
+        job: with `PHASES`; each stage has a folder in its own.
 
     Raises:
-        StudyError: a fault of the file or the folder; a stage that cannot run.
+        StudyError: a stage that cannot run.
     """
-    config.require_configured()
-    out, console = Path(out), console or Console(highlight=False, markup=False)
-    if measured.commission.processor:
-        check_tools()
-    with locked_folder(out, "commissioning"):
-        refuse_existing(out, COMMISSIONINGS, is_resumed)
-        request = make_manifest(measured.data, DECISIVE) | {"files": measured.data_files()}
-        checked = {"spec": "file", "code": "program", "files": "set of data"}
-        keep_request(out / COMMISSIONINGS.mark, request, checked)
-        outcome = _outcome(measured, out, console)
-        with publish(out) as staging:
-            (staging / DOCUMENT).write_text(json_text(outcome), encoding="utf-8")
-            write_report(report := say(outcome), staging)
-    print_result(report, console)
-    announce(console, out / REPORT)
-    return outcome
-
-
-def _outcome(measured: MeasuredSpec, out: Path, console: Console) -> CommissionFindings:
-    """All stages, up to the first one whose answer does not support the next."""
+    out = job.place
     outcome = CommissionFindings(out, measured, measured.study.title)
     for stage in STAGES:
-        fault = _run(stage, measured, out, console)
-        outcome = _judged(outcome, stage, fault, measured, console)
+        job.begin(stage.name, stage.text)
+        fault = _run(stage, measured, job)
+        outcome = _judged(outcome, stage, fault, measured, job)
         keep_answer(stage, out)
         if outcome.refusals:
             break
-    return outcome
+    with publish(out) as staging:
+        (staging / DOCUMENT).write_text(json_text(outcome), encoding="utf-8")
+        write_report(say(outcome), staging)
+    return in_folder(outcome, out)
 
 
-def _run(stage: Stage, measured: MeasuredSpec, out: Path, console: Console) -> str:
+def _run(stage: Stage, measured: MeasuredSpec, job: Job) -> str:
     """Do a stage unless it is done; what it refuses, "" if nothing."""
-    number = f"stage {STAGES.index(stage) + 1} of {len(STAGES)}, {stage.name}"
-    if stage.is_done(out):
-        check_answer(stage, out)
-        console.print(f"{number}: already computed")
+    if stage.is_done(job.place):
+        check_answer(stage, job.place)
+        job.say("already computed")
         return ""
-    console.print(f"{number}: {stage.text}")
     try:
-        stage.make(measured, out, console)
+        stage.make(measured, job)
     except StudyError as error:
         if stage is STAGES[0]:  # nothing is known yet: the file is at fault
             raise
@@ -114,16 +82,16 @@ def _run(stage: Stage, measured: MeasuredSpec, out: Path, console: Console) -> s
 
 
 def _judged(
-    outcome: CommissionFindings, stage: Stage, fault: str, measured: MeasuredSpec, console: Console
+    outcome: CommissionFindings, stage: Stage, fault: str, measured: MeasuredSpec, job: Job
 ) -> CommissionFindings:
     """The outcome with a stage's answer, and with what speaks against going on."""
     outcome = outcome.replace(last_stage=stage.name)
     if fault:
         return outcome.replace(refusals=(f"{stage.name}: {fault}",))
-    return _JUDGES[stage.name](outcome, measured.commission.gain_margin, console)
+    return _JUDGES[stage.name](outcome, measured.commission.gain_margin, job)
 
 
-def _judge_fit(outcome: CommissionFindings, wanted: float, console: Console) -> CommissionFindings:
+def _judge_fit(outcome: CommissionFindings, wanted: float, job: Job) -> CommissionFindings:
     """Its gravest messages, if it is no ground for a design."""
     fit = fit_document(outcome.out)
     is_ground = fit["is_explained"] and fit["is_converged"]
@@ -131,11 +99,9 @@ def _judge_fit(outcome: CommissionFindings, wanted: float, console: Console) -> 
     return outcome.replace(fit=fit, refusals=texts)
 
 
-def _judge_tuned(
-    outcome: CommissionFindings, wanted: float, console: Console
-) -> CommissionFindings:
+def _judge_tuned(outcome: CommissionFindings, wanted: float, job: Job) -> CommissionFindings:
     """The gain margins of its controller on all possible machines."""
-    margins = _margins(outcome.out, console)
+    margins = _margins(job)
     tuned = tuned_design(outcome.out).study
     is_fast = has_fast_motion(outcome.out, tuned)
     price = price_text(outcome.out, tuned)
@@ -148,24 +114,20 @@ def _judge_tuned(
     return outcome.replace(refusals=(text,) if low else ())
 
 
-def _judge_certificate(
-    outcome: CommissionFindings, wanted: float, console: Console
-) -> CommissionFindings:
+def _judge_certificate(outcome: CommissionFindings, wanted: float, job: Job) -> CommissionFindings:
     certificate = certificate_document(outcome.out)
     text = f"certificate {certificate['verdict']}"
     refusals = () if certificate["is_passed"] else (text,)
     return outcome.replace(certificate=certificate, refusals=refusals)
 
 
-def _judge_firmware(
-    outcome: CommissionFindings, wanted: float, console: Console
-) -> CommissionFindings:
+def _judge_firmware(outcome: CommissionFindings, wanted: float, job: Job) -> CommissionFindings:
     text = "the exported code does not behave as the controller that was designed"
     return outcome.replace(refusals=() if is_verified(outcome.out) else (text,))
 
 
 #: By name of the stage: its answer, of the outcome so far and the least gain margin.
-_JUDGES: dict[str, Callable[[CommissionFindings, float, Console], CommissionFindings]] = {
+_JUDGES: dict[str, Callable[[CommissionFindings, float, Job], CommissionFindings]] = {
     "fit": _judge_fit,
     "tune": _judge_tuned,
     "certificate": _judge_certificate,
@@ -173,14 +135,8 @@ _JUDGES: dict[str, Callable[[CommissionFindings, float, Console], CommissionFind
 }
 
 
-def _margins(out: Path, console: Console) -> np.ndarray:
+def _margins(job: Job) -> np.ndarray:
     """Gain margins on all possible machines, kept in the folder."""
-    file = out / "tune" / MARGINS
-    if file.is_file():
-        return np.load(file)
-    machines = possible_machines(out)
-    console.print(f"gain margins on {len(machines.values)} machines that the data leave possible")
-    margins = margins_on(machines, tuned_design(out).study)
-    with replacing(file) as temporary, open(temporary, "wb") as target:
-        np.save(target, margins)
-    return margins
+    machines, study = possible_machines(job.place), tuned_design(job.place).study
+    job.say(f"gain margins on {len(machines.values)} machines that the data leave possible")
+    return job.part("margins", lambda: margins_on(machines, study), study.model_dump_json())

@@ -6,7 +6,6 @@ differs from the default; its machines are those of the fit. `[commission]` is d
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +17,7 @@ from studies.errors import StudyError, field_error, nearest
 from studies.export.firmware.boards import BOARDS
 from studies.export.run import DAC_BITS
 from studies.export.targets import TARGETS
-from studies.fitting.spec import FileEntry, FitSpec, parse_fit
+from studies.fitting.spec import FitSpec, parse_fit
 from studies.laws.candidates import RATIOS, law_candidate
 from studies.spillover.plants import MISMATCHES
 from studies.study.explain import explain
@@ -58,19 +57,6 @@ class MeasuredSpec(NamedTuple):
     tune: dict[str, Any]  # section [tune] as written
     commission: Commission
     data: dict[str, Any]  # the whole file
-
-    def data_files(self) -> dict[str, str]:
-        """Digests of the files with the measured data, by name; "" of those that are not there."""
-        names = {
-            entry.file.partition("::")[0]
-            for entry in self.fit.entries
-            if isinstance(entry, FileEntry)
-        }
-        paths = {name: self.fit.folder / name for name in sorted(names)}
-        return {
-            name: hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
-            for name, path in paths.items()
-        }
 
     @property
     def keeps_motion(self) -> bool:

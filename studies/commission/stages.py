@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich.console import Console
 
 from studies.commission.machines import (
     Possible,
@@ -20,21 +19,26 @@ from studies.commission.machines import (
 from studies.commission.spec import RESERVE, MeasuredSpec, certified_margin, tuning_section
 from studies.engine.design import Design, load_design
 from studies.engine.fast_motion import TellingMotion, find_motion, with_own_motion
+from studies.engine.folder import TUNING
+from studies.engine.runs import resolved_study
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.export.run import FAILED, export_design
 from studies.export.run import REPORT as VERIFICATION
 from studies.export.targets import TARGETS
-from studies.fitting.run import DATA, DOCUMENT, STUDY, run_fit
+from studies.fitting.estimate import fit_phases
+from studies.fitting.run import DATA, DOCUMENT, STUDY, fitted_into
+from studies.job import Job, keep_request
 from studies.publish import REPORT, replacing
 from studies.reading import open_hdf5, read_json
 from studies.spillover.certificate import certify
 from studies.spillover.run import DOCUMENT as CERTIFICATE
-from studies.spillover.run import spillover_design
+from studies.spillover.run import certified, phases
 from studies.study.cases import build_case, build_structure
 from studies.study.spec import Study, load_study
 from studies.study.template import study_template
-from studies.tuning.run import run_tuning
+from studies.tuning.folder import CHECKED, fixed_part
+from studies.tuning.run import tune_phases, tune_request, tuned_into
 from studies.tuning.spec import parse_tuning
 
 #: The chosen controller as a study: the fitted machine, the motion of the file.
@@ -47,7 +51,7 @@ class Stage(NamedTuple):
     name: str  # of its folder
     text: str
     last: tuple[str, ...]  # files of the folder of all stages, of which one is written at its end
-    make: Callable[[MeasuredSpec, Path, Console], None]  # in the folder of all stages
+    make: Callable[[MeasuredSpec, Job], None]
     page: str = REPORT
 
     def is_done(self, out: Path) -> bool:
@@ -55,13 +59,14 @@ class Stage(NamedTuple):
         return any((out / file).is_file() for file in self.last)
 
 
-def _fit(measured: MeasuredSpec, out: Path, console: Console) -> None:
-    run_fit(measured.fit, out / "fit", console)
+def _fit(measured: MeasuredSpec, job: Job) -> None:
+    with job.inside("fit", fit_phases(measured.fit)) as stage:
+        fitted_into(measured.fit, stage)
 
 
-def _tune(measured: MeasuredSpec, out: Path, console: Console) -> None:
-    fitted, folder = fitted_study(out), out / "tune"
-    study = fitted
+def _tune(measured: MeasuredSpec, job: Job) -> None:
+    out = job.place
+    study = fitted = fitted_study(out)
     possible = possible_machines(out)
     columns, spread = unknown_to_controller(possible, study), margin_spread(possible, study)
     indexed = [name for name in columns if name.startswith("link.stiffness_factor[")]
@@ -70,11 +75,14 @@ def _tune(measured: MeasuredSpec, out: Path, console: Console) -> None:
         study = study.change(link__stiffness_factor=whole)
     motion = TellingMotion(study, "") if measured.keeps_motion else find_motion(study)
     if motion.text:
-        console.print(motion.text, soft_wrap=True)
+        job.say(motion.text)
     section = tuning_section(measured, motion.study, columns, spread)
     spec = parse_tuning(motion.study.model_dump() | {"tune": section})
-    run_tuning(spec, folder, True, console)  # goes on, or begins
-    chosen = _lowered(with_own_motion(load_design(folder).study, fitted), possible, measured)
+    with job.inside("tune", tune_phases(spec)) as stage:
+        request = {"verb": "tune", **tune_request(spec)}
+        keep_request(stage.place / TUNING, request, CHECKED, fixed_part)
+        tuned_into(spec, stage)
+    chosen = _lowered(with_own_motion(load_design(out / "tune").study, fitted), possible, measured)
     with replacing(out / DESIGN) as temporary:
         temporary.write_text(study_template(chosen), encoding="utf-8")
 
@@ -107,19 +115,20 @@ def price_text(out: Path, tuned: Study) -> str:
     )
 
 
-def _certify(measured: MeasuredSpec, out: Path, console: Console) -> None:
-    design, margin = tuned_design(out), certified_margin(measured)
-    bases = (design.study.link.basis,)  # other loop gains would not have explained the data
-    spillover_design(design, out / "certificate", margin, console, bases=bases)
+def _certify(measured: MeasuredSpec, job: Job) -> None:
+    study, margin = resolved_study(tuned_design(job.place).study), certified_margin(measured)
+    bases = (study.link.basis,)  # other loop gains would not have explained the data
+    with job.inside("certificate", phases(has_proofs=False)) as stage:
+        certified(study, stage, margin, bases=bases)
 
 
-def _export(measured: MeasuredSpec, out: Path, console: Console) -> None:
+def _export(measured: MeasuredSpec, job: Job) -> None:
     wanted = measured.commission
     export_design(
-        tuned_design(out),
+        tuned_design(job.place),
         wanted.target,
-        out / "firmware",
-        console=console,
+        job.place / "firmware",
+        console=job.phases.console,
         dac_bits=wanted.dac_bits if TARGETS[wanted.target].has_dac else None,
         pil=wanted.processor or None,
     )

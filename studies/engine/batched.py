@@ -18,7 +18,7 @@ import numpy as np
 from jaxmodel.case import Case, Structure
 from jaxmodel.judge import LoopVerdicts, can_judge, judge
 from jaxmodel.parameters import Array
-from jaxmodel.simulate import Result
+from jaxmodel.simulate import RunResult
 from studies.engine.function import BlockFunction, fastest_function
 from studies.engine.plan import STATIC, lane_unit, padded_rows
 from studies.engine.preflight import check_run
@@ -71,7 +71,7 @@ def batched(study: Study, names: Sequence[str], is_judged: bool = False) -> Call
 
 def _run(
     study: Study, structure: Structure, positions: tuple[Any, ...]
-) -> Callable[[Array], Result]:
+) -> Callable[[Array], RunResult]:
     exact = _batch_program(study, structure, positions)
     if structure.is_smooth:
         return exact
@@ -79,7 +79,7 @@ def _run(
     rounded = jax.custom_jvp(exact)
 
     @rounded.defjvp
-    def rule(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Result, Result]:
+    def rule(primals: tuple[Array], tangents: tuple[Array]) -> tuple[RunResult, RunResult]:
         return exact(*primals), jax.jvp(smooth, primals, tangents)[1]
 
     return rounded
@@ -161,7 +161,7 @@ class _Build:
 
 def _batch_program(
     study: Study, structure: Structure, positions: tuple[Any, ...]
-) -> Callable[[Array], Result]:
+) -> Callable[[Array], RunResult]:
     shared, build = one_study(study, structure), _Build(structure, positions)
 
     @cache
@@ -169,7 +169,7 @@ def _batch_program(
         free = np.zeros((lanes, count), jax.dtypes.canonicalize_dtype(float))
         return fastest_function(structure, build, free, [], shared)
 
-    def run(parameters: Array) -> Result:
+    def run(parameters: Array) -> RunResult:
         n = len(parameters)
         rows = padded_rows(n, lane_unit())
         one_block = outside(function, len(rows), parameters.shape[1])

@@ -9,38 +9,34 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.simulate import Result, simulate
+from jaxmodel.simulate import RunResult, simulate
 from studies.engine.programs import kept_jit
 
 #: Cases per call of the compiled program; the last batch is filled up with copies.
 BATCH = 8
 
-#: Called with the current step in words, and the share of the work since the last call.
-ProgressCallback = Callable[[str, float], None]
-
 
 @kept_jit(static_argnums=0)
-def _simulate_batch(structure: Structure, cases: Case) -> Result:
+def _simulate_batch(structure: Structure, cases: Case) -> RunResult:
     return jax.vmap(lambda case: simulate(structure, case, True))(cases)
 
 
-def run_batches(structure: Structure, cases: list[Case], on_progress: ProgressCallback) -> Result:
+def run_batches(structure: Structure, cases: list[Case], say: Callable[[str], object]) -> RunResult:
     """Run cases, `BATCH` at a time, with trajectories.
 
     Args:
         structure: of all of them.
         cases: one or more.
-        on_progress: called with progress messages.
+        say: called with what is done next.
 
     Returns:
-        Result of NumPy arrays, (cases, ...).
+        RunResult of NumPy arrays, (cases, ...).
     """
     parts = []
     for start in range(0, len(cases), BATCH):
         batch = cases[start : start + BATCH]
-        on_progress(f"simulating {len(batch)} cases", 0.0)
+        say(f"simulating {len(batch)} cases")
         filled = batch + [batch[-1]] * (BATCH - len(batch))
         result = _simulate_batch(structure, jax.tree.map(lambda *x: jnp.stack(x), *filled))
         parts.append(jax.tree.map(lambda x: np.asarray(x)[: len(batch)], result))  # noqa: B023
-        on_progress(f"simulated {len(batch)} cases", 1.0)
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -57,15 +57,14 @@ LIGHTER = 0.5
 SMALL = 0.1
 
 
-def parse_tolerances(texts: Iterable[str]) -> MachineChange:
-    """`TOLERANCES` with others from texts NAME=VALUE; 0: this number does not change.
+def parse_tolerances(given: Mapping[str, float | str] | None) -> MachineChange:
+    """`TOLERANCES` with others by their names; 0: this number does not change.
 
     Raises:
         StudyError: unknown name, or no number from 0.
     """
     tolerances = TOLERANCES
-    for text in texts:
-        name, _, value = (part.strip() for part in text.partition("="))
+    for name, value in (given or {}).items():
         if name not in MachineChange._fields:
             allowed = f"{', '.join(MachineChange._fields)}, each as NAME=VALUE"
             raise field_error(

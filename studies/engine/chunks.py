@@ -14,14 +14,15 @@ import numpy as np
 from rich.console import Console
 
 from jaxmodel.case import Case, Structure, with_ratio
-from jaxmodel.simulate import Result
+from jaxmodel.simulate import RunResult
 from studies.engine.executor import Executor, own_ratios
 from studies.engine.margins import judge_loops, no_margins
 from studies.engine.plan import MANY, Chunk, Group, Layout, chunk_cases, local_layout
-from studies.engine.progress import Phases, Reporter
+from studies.engine.progress import Reporter
 from studies.engine.robustness import judge_robustness
 from studies.engine.stability import LoopFigures
 from studies.kernels.compilation import compiler_time
+from studies.phases import Phases
 from studies.space.table import CaseTable
 from studies.study.cases import signed_power
 from studies.study.fields import row_keys
@@ -39,7 +40,7 @@ class Done(NamedTuple):
 class JudgedChunk(NamedTuple):
     """Runs of a chunk, and the judgement of its loops."""
 
-    result: Result
+    result: RunResult
     margins: LoopFigures
     has_verdict: bool  # on sampled loops: their margins are numbers, or could not be found
 

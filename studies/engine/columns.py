@@ -16,8 +16,8 @@ from studies.study.labels import DISTANCE_TEXT, POSE_UNITS, STATION_TEXT, STATUS
 from studies.study.paths import field_unit, parse_entry
 from studies.study.spec import Study
 
-#: Status of a case that has not run, and of one that its screen left out.
-NOT_RUN, LEFT_OUT = -1, -2
+#: Status of a case that has not run.
+NOT_RUN = -1
 
 
 #: Names of the axes of fields that are lists, outermost first.
@@ -43,7 +43,7 @@ PER_CASE: dict[str, tuple[Any, ...]] = {
     "status": (
         (),
         *STATUS_LABEL[:2],
-        {LEFT_OUT: "left out by the screen", NOT_RUN: "not run", **STATUS_LABEL[2]},
+        {NOT_RUN: "not run", **STATUS_LABEL[2]},
     ),
     "bad_time": ((), "s", "when the status appeared, 0 if ok"),
     "command_end": ((), "s", "end of the shaped reference trajectory"),
@@ -100,13 +100,6 @@ ON_DEMAND: dict[str, tuple[str, str]] = {
     ),
 }
 PER_CASE |= {name: ((), *label) for name, label in ON_DEMAND.items()}
-
-
-#: Variables of every case of a screened sweep: what the linear model found.
-SCREENED: dict[str, tuple[Any, ...]] = {
-    "screen_status": ((), STATUS_LABEL[0], "how the linear run ended", PER_CASE["status"][-1]),
-    "screen_value": ((), "1", "what the screen ranks by, from the linear model, in its SI unit"),
-}
 
 
 POSE = np.array(["x", "y", "phi"])
@@ -192,7 +185,7 @@ RECORD: dict[str, tuple[Any, ...]] = {
 
 def label_of(name: str) -> tuple[Any, ...]:
     """Axes, unit, long name and any flags of a number or trajectory of a run."""
-    own = PER_CASE | SCREENED | RECORD
+    own = PER_CASE | RECORD
     if name in own:
         return own[name]
     metric = METRICS[name]

@@ -11,7 +11,6 @@ import numpy as np
 
 from studies.engine.columns import PER_CASE
 from studies.engine.results import SweepData, as_sweep, swept_names
-from studies.engine.stored import CODES
 from studies.results.labelled import Variable
 from studies.space.spec import BlockNode
 from studies.space.table import all_columns
@@ -50,8 +49,7 @@ def as_dataset(data: SweepData) -> xarray.Dataset:
     import xarray
 
     data = _whole_grid(data)
-    codes = {name: v for name, v in data.variables.items() if name in CODES}
-    variables = data.variables | {f"{name}_text": _words(code) for name, code in codes.items()}
+    variables = data.variables | {"status_text": _words(data.variables["status"])}
     coordinates = {"case", "case_id", "seed", "repeat", *data.table.columns, *axis_sizes(variables)}
     axes = _grid_axes(data)
     if axes:

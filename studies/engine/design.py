@@ -52,18 +52,19 @@ class Design(NamedTuple):
     case_id: str = ""  # of the case in its sweep
 
 
-def as_design(given: Design | Study | str | Path) -> Design:
-    """A design from what stands for it: a study, or what `load_design` reads.
+def as_design(given: Design | Study | str | Path, case: int | str | None = None) -> Design:
+    """A design from what stands for it: a study, or what `load_design` reads; case: as there.
 
     Raises:
         StudyError: something else, or as `load_design`.
     """
     if isinstance(given, str | Path):
-        return load_design(given)
+        return load_design(given, case)
+    if case is not None:
+        raise StudyError(f"--case {case}: for folders only; leave it out")
     if not isinstance(given, Design | Study):
         raise StudyError(
-            f"design: {type(given).__name__}; expected a design, as load_design returns, a study "
-            "or its file"
+            f"{type(given).__name__}; expected a study, its file, or a folder of results"
         )
     return Design(given, {}) if isinstance(given, Study) else given
 

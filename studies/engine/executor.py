@@ -17,7 +17,7 @@ import numpy as np
 from jaxmodel import status
 from jaxmodel.case import Case, Structure, uncontrolled, with_ratio
 from jaxmodel.metrics import Metrics
-from jaxmodel.simulate import Result
+from jaxmodel.simulate import RunResult
 from studies.config import processor
 from studies.engine.function import STEPPERS, BlockFunction, block_function, stepper
 from studies.engine.plan import Layout
@@ -34,7 +34,7 @@ Place = Callable[[Any, Any], Case]
 class Running(NamedTuple):
     """A running chunk."""
 
-    wait: Callable[[], Result]  # until it is done; NumPy arrays
+    wait: Callable[[], RunResult]  # until it is done; NumPy arrays
     cancel: Callable[[], None]  # cancel what has not started yet
 
 
@@ -197,7 +197,7 @@ class Executor:
             raise NoKernelError(f"the GPU kernel failed: {str(error).splitlines()[0]}") from error
 
 
-def _join(parts: list[Result]) -> Result:
+def _join(parts: list[RunResult]) -> RunResult:
     return jax.tree.map(lambda *x: np.concatenate([np.asarray(one) for one in x]), *parts)
 
 
@@ -206,7 +206,7 @@ class Differentiated:
 
     def __init__(
         self,
-        result: Result,
+        result: RunResult,
         pull_backs: list[Callable[[Any], Any]],
         n_parameters: int,
         pool: ThreadPoolExecutor,

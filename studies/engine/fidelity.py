@@ -12,10 +12,11 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
-from studies.engine.chunks import run_quietly
+from studies.engine.chunks import Done, run_quietly
+from studies.engine.columns import named
 from studies.engine.plan import local_layout, plan_groups
-from studies.engine.results import direction
-from studies.engine.screen import chunk_values
+from studies.engine.results import SweepData, direction, metric_values
+from studies.engine.stored import chunk_arrays
 from studies.errors import StudyError
 from studies.space.spec import SweepSpec
 from studies.space.table import CaseTable
@@ -42,10 +43,14 @@ class Agreement(NamedTuple):
     @property
     def text(self) -> str:
         """In one sentence."""
+        return self.told("random")
+
+    def told(self, which: str) -> str:
+        """The same of which designs."""
         if np.isnan(self.correlation):
-            return f"{self.n} random designs end well in both models: too few to compare {self.by}"
+            return f"{self.n} {which} designs end well in both models: too few to compare {self.by}"
         return (
-            f"{self.n} random designs by the linear and the full model: rank correlation of "
+            f"{self.n} {which} designs by the linear and the full model: rank correlation of "
             f"{self.by} {self.correlation:.2f}, {self.recalled} of the best {self.n // 4} in "
             "common"
         )
@@ -72,7 +77,17 @@ def agreement(spec: SweepSpec, table: CaseTable, by: str) -> Agreement | None:
     if entry.partition("[")[0] not in METRICS:
         return None
     rows = np.sort(np.random.default_rng(spec.sweep.seed).permutation(len(table))[:TRIED])
-    linear, full = (_values(spec, table, rows, entry, x) for x in (True, False))
+    return alike(by, *(_values(spec, table, rows, entry, x) for x in (True, False)))
+
+
+def alike(by: str, linear: np.ndarray, full: np.ndarray) -> Agreement:
+    """How alike two models rank designs.
+
+    Args:
+        by: what they are ranked by.
+        linear, full: its values by each model, NaN where the run is not ok, (n,).
+    """
+    entry = by.removeprefix("-")
     is_there = np.isfinite(linear) & np.isfinite(full)
     sign = -1 if direction(by) == "largest" else 1
     linear, full = sign * linear[is_there], sign * full[is_there]
@@ -81,6 +96,23 @@ def agreement(spec: SweepSpec, table: CaseTable, by: str) -> Agreement | None:
         return Agreement(entry, count, np.nan, 0)
     best = [set(np.argsort(x, kind="stable")[: count // 4].tolist()) for x in (linear, full)]
     return Agreement(entry, count, rank_correlation(linear, full), len(best[0] & best[1]))
+
+
+def chunk_values(
+    spec: SweepSpec, table: CaseTable, done: Done, entry: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Status of the cases of a chunk, and what they are ranked by, (n,) each.
+
+    Args:
+        spec: the sweep.
+        table: all cases.
+        done: the chunk.
+        entry: a metric, or an entry of it.
+    """
+    arrays = chunk_arrays(table, done, [entry.partition("[")[0]])
+    variables = {name: named(name, data, "case") for name, data in arrays.items()}
+    value = metric_values(SweepData(variables, {}, spec, table), entry)
+    return arrays["status"], np.asarray(value, float)
 
 
 def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:

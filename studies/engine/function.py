@@ -26,7 +26,7 @@ import numpy as np
 from jaxmodel.case import Case, Structure
 from jaxmodel.loop import State, step
 from jaxmodel.metrics import Metrics
-from jaxmodel.simulate import Outline, Result, Start, begin, conclude
+from jaxmodel.simulate import Outline, RunResult, Start, begin, conclude
 from studies import sources
 from studies.config import device_now, is_keeping, processor
 from studies.engine.programs import is_plain, kept_data, modules_of, program, quick_options
@@ -124,7 +124,7 @@ class BlockFunction:
 
     # --- the parts, as JAX functions -------------------------------------------------------------
 
-    def __call__(self, free: Any, own: Any) -> Result:
+    def __call__(self, free: Any, own: Any) -> RunResult:
         """Results of `lanes` cases."""
         return self.finish(self.prepare(free, own, self._numbers), self.shared)
 
@@ -149,7 +149,7 @@ class BlockFunction:
         leaves: list[Any] = each(free, own, shared)
         return leaves
 
-    def finish(self, varying: list[Any], shared: list[Any]) -> Result:
+    def finish(self, varying: list[Any], shared: list[Any]) -> RunResult:
         """Results of cases from the leaves of their starts.
 
         Args:
@@ -247,12 +247,12 @@ class BlockFunction:
 
     # --- compiled --------------------------------------------------------------------------------
 
-    def run(self, free: Any, own: Any) -> Result:
+    def run(self, free: Any, own: Any) -> RunResult:
         """Results of a block, JAX arrays; may be called from several threads."""
         varying = self._program("prepare", self.prepare, free, own, self._numbers)
         return self._finished("finish", self.finish, varying)
 
-    def linearise(self, free: Any, own: Any) -> tuple[Result, Callable[[Any], Any]]:
+    def linearise(self, free: Any, own: Any) -> tuple[RunResult, Callable[[Any], Any]]:
         """Results of a block, and the function that pulls cotangents of its metrics back.
 
         Returns:
@@ -271,7 +271,7 @@ class BlockFunction:
 
         return result, pull_back
 
-    def jacobian(self, free: Any, own: Any) -> tuple[Result, Metrics]:
+    def jacobian(self, free: Any, own: Any) -> tuple[RunResult, Metrics]:
         """Results of a block whose cases share their free numbers, and derivatives by these.
 
         Args:
@@ -347,10 +347,10 @@ class BlockFunction:
 
     def _judged(
         self, varying: list[Any], shared: list[Any]
-    ) -> Callable[[list[Any]], tuple[Metrics, Result]]:
+    ) -> Callable[[list[Any]], tuple[Metrics, RunResult]]:
         """Metrics as a function of the leaves that move, and the results."""
 
-        def judged(moving: list[Any]) -> tuple[Metrics, Result]:
+        def judged(moving: list[Any]) -> tuple[Metrics, RunResult]:
             own = iter(moving)
             each = zip(varying, self._varying_moves, strict=True)
             result = self.finish([next(own) if moves else x for x, moves in each], shared)
@@ -449,7 +449,7 @@ _begin = jax.jit(begin, static_argnums=0)
 
 @jax.jit
 @partial(jax.vmap, in_axes=(-1, -1, -1))
-def _conclude(outline: Outline, code: Any, last: State) -> Result:
+def _conclude(outline: Outline, code: Any, last: State) -> RunResult:
     """Results of cases whose outline and last state have lanes last; cases first."""
     return conclude(outline, code, last)
 

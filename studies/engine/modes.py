@@ -14,7 +14,7 @@ from jaxmodel.prepare import prepare
 from studies.engine.preflight import check_pose
 from studies.engine.programs import kept_jit
 from studies.engine.simplifications import warn_of_patches, warn_of_sizes
-from studies.publish import shown
+from studies.result import Result
 from studies.results.labelled import Labelled, derived, labelled, told, unwritten
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study, parse_study
@@ -51,7 +51,7 @@ class NaturalMode(Labelled):
         return f"{links}, mode {self.order}, {percent}"
 
 
-class NamedModes(Labelled, command="modes", version=2):
+class NamedModes(Labelled, Result, command="modes", version=2):
     """What `studies modes --json` prints: natural modes of the machine at a pose.
 
     `link_share` is the strain energy k_ij |q_ij|^2 in modal coordinate j of link i over the mode's
@@ -69,9 +69,6 @@ class NamedModes(Labelled, command="modes", version=2):
     drive_share: np.ndarray = unwritten()  # [1], (m,)
     turn_share: np.ndarray = unwritten()  # of rotation in the platform's kinetic energy [1], (m,)
     has_stretch: bool = unwritten(default=False)  # links lengthen
-
-    def _repr_html_(self) -> str:
-        return shown(self)
 
     @derived("", "ascending in frequency")
     def modes(self) -> list[NaturalMode]:

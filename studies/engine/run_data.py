@@ -17,7 +17,7 @@ from jaxmodel.delay import command_change, true_delay
 from jaxmodel.hysteresis import added_voltage, advance_plays, design_hysteresis
 from jaxmodel.loop_figures import MARGIN_MODES
 from jaxmodel.prepare import left_out_deflection, spectrum_frequencies
-from jaxmodel.simulate import Result
+from jaxmodel.simulate import RunResult
 from studies import config
 from studies.engine.columns import RECORD, axis_variables, named
 from studies.engine.poles import PoleReport
@@ -29,7 +29,7 @@ from studies.study.labels import STATUS_LABEL
 from studies.study.spec import Study
 
 
-def metric_variables(result: Result, *axes: str) -> dict[str, Variable]:
+def metric_variables(result: RunResult, *axes: str) -> dict[str, Variable]:
     """Labelled metrics of a run, or of runs along some axes."""
     return {name: named(name, np.asarray(data), *axes) for name, data in result.metrics.items()}
 

@@ -13,13 +13,12 @@ import numpy as np
 from jaxmodel import status
 from jaxmodel.case import Case, Structure, uncontrolled, with_ratio
 from jaxmodel.loop_figures import MARGINS
-from jaxmodel.simulate import Result, simulate
+from jaxmodel.simulate import RunResult, simulate
 from studies.engine.poles import PoleReport, pole_report, tracked_modes
 from studies.engine.preflight import check_run
 from studies.engine.programs import drop_programs, kept_jit
 from studies.engine.robustness import judge_robustness
 from studies.engine.stability import LoopFigures, run_report
-from studies.publish import shown
 from studies.study.cases import as_numpy, signed_power
 from studies.study.spec import Study
 from studies.threads import serial_blas
@@ -33,14 +32,11 @@ class Run(NamedTuple):
     study: Study
     structure: Structure
     case: Case  # NumPy arrays
-    result: Result  # NumPy arrays
+    result: RunResult  # NumPy arrays
     status: int  # code of `jaxmodel.status`; UNSTABLE and UNJUDGED come from the linearised loop
     loop: LoopFigures | None = None  # of its linearised sampled loop, if that is judged
     motion: LoopFigures | None = None  # with the forces of the motion, (k,)
     poles: PoleReport | None = None  # specified and obtained, where gains follow from poles
-
-    def _repr_html_(self) -> str:
-        return shown(self)
 
 
 def run_study(

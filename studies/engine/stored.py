@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,22 +16,23 @@ from jaxmodel.lazy import jax
 from jaxmodel.metrics import METRICS
 from studies.engine.columns import (
     LEAST,
-    LEFT_OUT,
     NOT_RUN,
     ON_DEMAND,
     PER_CASE,
-    SCREENED,
     axis_variables,
     case_variables,
     mask_unused,
     named,
 )
 from studies.engine.folder import JOINED, Finished
-from studies.errors import field_error, nearest
+from studies.errors import StudyError, field_error, nearest
 from studies.results.labelled import Variable
+from studies.space.condition import evaluate
 from studies.space.spec import SweepSpec
-from studies.space.table import CaseTable
+from studies.space.table import CaseTable, metric_sizes
 from studies.store import LazyArray, axis_sizes, write_store
+from studies.study.entries import parse_entries
+from studies.study.paths import NAMED_INDEX
 
 if TYPE_CHECKING:
     from studies.engine.chunks import Done
@@ -56,6 +57,36 @@ def kept_metrics(spec: SweepSpec) -> list[str]:
             f"with float32 a list of {accurate()}",
         )
     return kept
+
+
+def check_names(spec: SweepSpec, table: CaseTable) -> None:
+    """Reject a sweep that ranks by or asks for what no case has, before anything runs.
+
+    Args:
+        spec: the sweep.
+        table: its cases, or some of them.
+
+    Raises:
+        StudyError: so it does.
+    """
+    metrics, sizes = kept_metrics(spec), metric_sizes(table)
+    parse_entries(spec.sweep.by.removeprefix("-"), "sweep.by", sizes)
+
+    def lookup(name: str) -> np.ndarray:
+        key = NAMED_INDEX.sub("", name).partition("[")[0]
+        if key in metrics:
+            parse_entries(name, sizes=sizes)
+        elif key in METRICS:
+            raise StudyError(f"{name!r}: sweep.metrics does not keep it")
+        elif key not in PER_CASE:
+            close = nearest(key, (*metrics, *PER_CASE))
+            if close:
+                raise StudyError(f"unknown {name!r}; did you mean {close!r}?")
+            return table.values(name)[:1]
+        return np.ones(1)
+
+    if spec.sweep.subject_to:
+        evaluate(spec.sweep.subject_to, lookup, "sweep.subject_to")
 
 
 def inaccurate(names: Iterable[str]) -> list[str]:
@@ -121,30 +152,18 @@ def chunk_arrays(table: CaseTable, done: Done, kept: list[str]) -> dict[str, np.
     return arrays
 
 
-#: How cases ended.
-CODES = {"status", "screen_status"}
-
-
-def gather(
-    table: CaseTable, finished: Finished, names: Collection[str] | None = None
-) -> dict[str, Variable]:
+def gather(table: CaseTable, finished: Finished) -> dict[str, Variable]:
     """Variables of all cases of a table, from the files that hold them.
 
     Args:
         table: all cases.
         finished: from `finished_cases`.
-        names: of the variables; None: all of the whole model.
 
     Returns:
         Those that any file has, and the status; NaN and -1 for missing cases.
     """
-    names = (*PER_CASE, *METRICS) if names is None else tuple(names)
-    columns = joined_columns(table, finished, names)
-    whole = slice(0, len(table))
-    variables = {name: v._replace(data=v.data.read(whole)) for name, v in columns.items()}
-    for name in sorted(CODES.intersection(names) - variables.keys()):
-        variables[name] = named(name, np.full(len(table), NOT_RUN), "case")
-    return variables
+    columns, whole = joined_columns(table, finished), slice(0, len(table))
+    return {name: v._replace(data=v.data.read(whole)) for name, v in columns.items()}
 
 
 def manifest_attributes(manifest: Mapping[str, Any]) -> dict[str, Any]:
@@ -160,7 +179,6 @@ def merge(
     table: CaseTable,
     finished: Finished,
     attributes: dict[str, Any],
-    screened: Finished | None = None,
 ) -> None:
     """Join all finished cases in one file, in parts to save memory.
 
@@ -169,29 +187,18 @@ def merge(
         table: all cases, in the order of the file.
         finished: from `finished_cases`.
         attributes: global ones.
-        screened: the same for the screen, if there is one.
 
     Raises:
         StudyError: the disk is full or not writable.
     """
     variables = case_variables(table)
     labels = {**attributes, "coordinates": " ".join(variables)}  # for xarray
-    code = gather(table, finished, ["status"])["status"].data
-    if screened is not None:
-        variables |= joined_columns(table, screened, SCREENED)
-        linear = gather(table, screened, ["screen_status"])["screen_status"].data
-        # what no run can start with is a fault in either model
-        rest = np.where(np.isin(linear, status.FINISHED), LEFT_OUT, linear)
-        code = np.where(code == NOT_RUN, rest, code)
-    variables |= joined_columns(table, finished, (*PER_CASE, *METRICS))
-    variables["status"] = named("status", code, "case")
+    variables |= joined_columns(table, finished)
     variables |= axis_variables(table.study, axis_sizes(variables), table.columns)
     write_store(folder / JOINED, variables, labels)
 
 
-def joined_columns(
-    table: CaseTable, finished: Finished, names: Collection[str]
-) -> dict[str, Variable]:
+def joined_columns(table: CaseTable, finished: Finished) -> dict[str, Variable]:
     """The same as `gather`, but the data are read when they are needed."""
     order = np.argsort(table.case_id)
     at = np.searchsorted(table.case_id[order], finished.case_id)
@@ -218,17 +225,16 @@ def joined_columns(
         return part
 
     columns = {}
-    for name, (shape, dtype) in _largest(finished.files, names).items():
+    for name, (shape, dtype) in _largest(finished.files).items():
         column = LazyArray((len(table), *shape), dtype, partial(read, name, shape, dtype))
         columns[name] = named(name, column, "case")
     return columns
 
 
-def _largest(
-    files: list[Path], names: Collection[str]
-) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+def _largest(files: list[Path]) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     """Largest shape of a row of each variable, and its type: programs differ in mode counts."""
-    largest: dict[str, tuple[tuple[int, ...], np.dtype]] = {}
+    largest: dict[str, tuple[tuple[int, ...], np.dtype]] = {"status": ((), np.dtype(int))}
+    names = (*PER_CASE, *METRICS)
     for file in files:
         with h5py.File(file, "r") as store:
             for name in (name for name in names if name in store):

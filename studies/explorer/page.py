@@ -6,21 +6,24 @@ import gzip
 import json
 from base64 import b64encode
 from collections.abc import Callable
+from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
-from rich.console import Console
 
 from studies.config import origin
-from studies.engine.progress import Phases
+from studies.console import make_console
 from studies.explorer.replays import DrawnMotion, ReplayedCase
 from studies.explorer.table import ExplorerTable, shown_rows
+from studies.phases import Phases
 from studies.publish import EXPLORER, check_target, replacing
+from studies.result import Result
 from studies.show.figures import CONTROLLED, SERIES, WITHOUT
 from studies.show.pages import render
+from studies.show.report import Report
 from studies.show.sketch import ACTUATOR, OFF, ON, SENSOR
 from studies.show.units import count_text
 
@@ -33,22 +36,33 @@ _FOLDER = Path(__file__).parent
 Fill = Callable[[Path, Callable[[int, int], None]], ExplorerTable]
 
 
+@dataclass(frozen=True, eq=False)
+class Explorer(Result):
+    """A page on which all cases of a folder can be looked at."""
+
+    page: Path
+
+    def report(self) -> Report:
+        return Report("Explorer", [f"explorer: {self.page}"], "", "", [], [], {})
+
+
 def write_explorer(
-    folder: Path, fill: Fill, console: Console | None = None, is_quiet: bool = False
-) -> Path:
-    """Write the page of a folder of results into it, and return its path.
+    folder: Path, fill: Fill, out: Path | None = None, progress: bool = False
+) -> Explorer:
+    """Write the page of a folder of results.
 
     Args:
         folder: with results.
         fill: makes the table of it.
-        console: where progress goes; default: nowhere.
-        is_quiet: hide it.
+        out: file of the page; None: in the folder.
+        progress: show it.
 
     Raises:
         StudyError: nothing to show, or the page cannot be written.
     """
-    check_target(folder / EXPLORER)
-    with Phases(console or Console(quiet=True), ("explore",), is_quiet) as phases:
+    page = out or folder / EXPLORER
+    check_target(page)
+    with Phases(make_console(), ("explore",), not progress) as phases:
 
         def on_progress(done: int, total: int) -> None:
             if phases.console.is_terminal or done == total:
@@ -56,11 +70,9 @@ def write_explorer(
 
         phases.begin("explore")
         text = explorer_page(fill(folder, on_progress))
-        with replacing(folder / EXPLORER) as temporary:
+        with replacing(page) as temporary:
             temporary.write_text(text, encoding="utf-8")
-    if console is not None and not is_quiet:
-        console.print(f"explorer: {folder / EXPLORER}", soft_wrap=True)
-    return folder / EXPLORER
+    return Explorer(page)
 
 
 def explorer_page(table: ExplorerTable) -> str:

@@ -8,7 +8,7 @@
 - Verification: `compiler` makes the code callable, `in_the_loop` runs it with the plant,
   `sequences` are inputs that no plant would produce, `verify` compares, `say` tells.
 - Processor: `firmware` makes a project of the code, builds it and runs it on an emulated one.
-- `targets` is the table of output formats, each made from a `job`; `run` leads from the design
+- `targets` is the table of output formats, each made from a `request`; `run` leads from the design
   to the files.
 """
 

@@ -26,15 +26,16 @@ from studies.export.fixed import ALLOWED_ERROR, check_words, dac_step_of
 from studies.export.fixed_blocks import design_integers
 from studies.export.floating import respond
 from studies.export.in_the_loop import LoopRun, law_of, run_in_the_loop
-from studies.export.job import check_loop
+from studies.export.request import check_loop
 from studies.export.run import checked_bits, checked_board
 from studies.export.say import whole_page
 from studies.export.verify import load_code, reference_run
-from studies.publish import announce, check_folder, publish, shown, working_folder
+from studies.publish import publish, working_folder
+from studies.result import Result, in_folder
 from studies.results.document import json_text
 from studies.results.labelled import Labelled, derived, labelled, told, unwritten
 from studies.show.listing import Rows
-from studies.show.report import Report, chapter, machine, print_result
+from studies.show.report import Report, chapter, machine
 from studies.study.margin import margin_text
 from studies.study.spec import Study
 
@@ -69,7 +70,7 @@ class Variant(Labelled):
         return not self.fault and self.word in (0, 32) and self.rounding <= ALLOWED_ERROR
 
 
-class ComparedVariants(Labelled, command="comparison", version=2):
+class ComparedVariants(Labelled, Result, command="comparison", version=2):
     """`comparison.json`, written by `studies export --compare`: a controller in several
     arithmetics and at several sample rates.
     """
@@ -95,8 +96,8 @@ class ComparedVariants(Labelled, command="comparison", version=2):
         """Whether any variant has a controller."""
         return not all(x.fault for x in self.variants)
 
-    def _repr_html_(self) -> str:
-        return shown(self)
+    def told(self) -> list[str]:
+        return [f"report: {self.out / PAGE}"]
 
 
 def compare_variants(
@@ -124,7 +125,6 @@ def compare_variants(
     if board is not None:
         check_tools()
     out, compiler = Path(out), find_compiler()
-    check_folder(out)
     if not compiler:
         raise StudyError(f"--compare: {NO_COMPILER}")
     check_codable(design.study)
@@ -149,11 +149,9 @@ def compare_variants(
         uncontrolled=uncontrolled,
     )
     with publish(out) as staging:
-        (staging / PAGE).write_text(whole_page(report := say(found)), encoding="utf-8")
+        (staging / PAGE).write_text(whole_page(say(found)), encoding="utf-8")
         (staging / DOCUMENT).write_text(json_text(found), encoding="utf-8")
-    print_result(report, console)
-    announce(console, out / PAGE)
-    return found
+    return in_folder(found, out)
 
 
 def _uncontrolled(study: Study) -> float:

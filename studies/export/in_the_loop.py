@@ -12,7 +12,7 @@ import numpy as np
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, adc_code, controller_step, read_back, rest_controller
 from jaxmodel.loop import Inputs, Loop, State, advance, filtered_voltage
-from jaxmodel.simulate import Result, Start, begin, conclude
+from jaxmodel.simulate import RunResult, Start, begin, conclude
 from studies.engine.programs import kept_jit
 
 
@@ -36,7 +36,7 @@ class LoopRun(NamedTuple):
     codes: np.ndarray  # of the ADC, (T, 3, K)
     voltage: np.ndarray  # commands [V], (T, 3, K)
     pose: np.ndarray  # [m, m, rad], (T, 3)
-    result: Result  # metrics and status, NumPy arrays
+    result: RunResult  # metrics and status, NumPy arrays
 
 
 def law_of(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -16,11 +17,11 @@ from studies.export.compiler import NO_COMPILER, find_compiler
 from studies.export.document import study_hash
 from studies.export.firmware.boards import BOARDS, Board
 from studies.export.firmware.build import check_tools
-from studies.export.job import Exported, ExportResult, Job
+from studies.export.request import Export, Exported, ExportResult
 from studies.export.say import say, whole_page
 from studies.export.targets import TARGETS
-from studies.publish import check_folder, publish
-from studies.show.report import print_result
+from studies.publish import publish
+from studies.result import in_folder
 from studies.study.spec import Study
 
 REPORT, FAILED = "verification.html", "verification-failed.html"
@@ -65,7 +66,6 @@ def export_design(
     if board is not None:
         _check_processor(board.name, target, is_verified)
     out = Path(out)
-    check_folder(out)
     console = console or Console(highlight=False, markup=False)
     needs_compiler = TARGETS[target].needs_compiler
     compiler = find_compiler() if needs_compiler else []
@@ -83,7 +83,7 @@ def export_design(
     exported = fixed_controller(design.study)
     if is_verified:  # by the study's own motion
         check_run(exported.study)
-    job = Job(
+    job = Export(
         exported=exported,
         name=name,
         origin=_origin(exported, design.case_id),
@@ -107,15 +107,11 @@ def export_design(
     # files of an earlier export stay unchanged
     texts = {} if made.has_failed else result.files
     if made.verified is not None:
-        report = say(made)
-        texts |= {FAILED if made.has_failed else REPORT: whole_page(report)}
-        print_result(report, console)
+        texts |= {FAILED if made.has_failed else REPORT: whole_page(say(made))}
     with publish(out, stale=() if made.has_failed else (REPORT, FAILED)) as staging:
         for file, text in texts.items():
             (staging / file).write_text(text, encoding="utf-8")
-    for file in texts:
-        console.print(f"written: {out / file}", soft_wrap=True)
-    return made._replace(files=tuple(out / file for file in texts))
+    return in_folder(replace(made, files=tuple(out / file for file in texts)), out)
 
 
 def _is_result(found: object) -> bool:

@@ -10,7 +10,7 @@ from studies.export.c_fixed import format_rows
 from studies.export.firmware.boards import CLOCKS
 from studies.export.firmware.project import STACK
 from studies.export.fixed import MARGIN
-from studies.export.job import Exported
+from studies.export.request import Exported
 from studies.export.verify import AIM, Verification
 from studies.publish import REPORT, working_folder
 from studies.show.listing import Rows

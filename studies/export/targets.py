@@ -1,6 +1,6 @@
 """Export targets: which files a controller becomes, and how they are verified.
 
-A `Target` makes the files of a `Job` and, if requested, compares them with the JAX controller.
+A `Target` makes the files of an `Export` and, if requested, compares them with the JAX controller.
 `TARGETS` is the only list of them; `TARGETS.add` adds your own.
 """
 
@@ -22,7 +22,7 @@ from studies.export.firmware.on_target import Comparison, verify_on_target
 from studies.export.fixed import Wires, check_error, check_words
 from studies.export.fixed_blocks import design_integers
 from studies.export.floating import respond
-from studies.export.job import ExportResult, Job, check_loop, reference_motion
+from studies.export.request import Export, ExportResult, check_loop, reference_motion
 from studies.export.verify import drive_checks, verify_document, verify_fixed, verify_floating
 
 
@@ -31,13 +31,13 @@ class Target(NamedTuple):
 
     name: str
     text: str  # what they are
-    make: Callable[[Job], ExportResult]
+    make: Callable[[Export], ExportResult]
     needs_compiler: bool = False  # for verification
     has_dac: bool = False  # accepts the resolution of a DAC
     has_pil: bool = False  # runs on the emulated processors
 
 
-def _export_json(job: Job) -> ExportResult:
+def _export_json(job: Export) -> ExportResult:
     loop = check_loop(job.exported, job.exported.channels, "")
     described = document(job.exported, job.case_id)
     files = {
@@ -51,7 +51,7 @@ def _export_json(job: Job) -> ExportResult:
     )
 
 
-def _export_floating(job: Job) -> ExportResult:
+def _export_floating(job: Export) -> ExportResult:
     loop = check_loop(job.exported, job.exported.channels, "")
     source = floating_source(job.exported, job.name, job.origin)
     files = _files(source, job.name)
@@ -68,7 +68,7 @@ def _export_floating(job: Job) -> ExportResult:
     return _on_target(job, ExportResult(files, loop, verified), source, None)
 
 
-def _export_fixed(job: Job) -> ExportResult:
+def _export_fixed(job: Export) -> ExportResult:
     exported = job.exported
     check_words(exported)
     if DRIVES[exported.structure.drive].is_sampled:
@@ -91,7 +91,9 @@ def _export_fixed(job: Job) -> ExportResult:
     return _on_target(job, result, source, fixed.wires)
 
 
-def _on_target(job: Job, result: ExportResult, source: Source, wires: Wires | None) -> ExportResult:
+def _on_target(
+    job: Export, result: ExportResult, source: Source, wires: Wires | None
+) -> ExportResult:
     """An export with its project, compared on the emulated processor; as it is without one."""
     if job.board is None or result.verified is None:
         return result

@@ -10,7 +10,7 @@ data leave possible, and the next experiment.
   `profiles` and `posterior` say what is known, `draw` draws machines, `experiment` says what to
   measure next.
 - `estimate` leads through all of these, `run` writes the folder, `report` and `plots` present it,
-  `commands` is `studies fit`.
+  `verb` is `studies.fit`.
 
 To add a kind of measurement, see `kinds`.
 """

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
-from rich.console import Console
 
 from studies.engine.preflight import check_run
-from studies.engine.progress import Phases
 from studies.errors import StudyError
 from studies.fitting.diagnosis import Remedy, diagnose
 from studies.fitting.draw import draw_machines
@@ -18,14 +16,14 @@ from studies.fitting.measurements import guess, make_bench, make_measurements
 from studies.fitting.posterior import Posterior, load_blackjax, sample, shape
 from studies.fitting.problem import Problem, check_sanity, make_problem
 from studies.fitting.profiles import Likelihood, describe_confirmed
-from studies.fitting.solve import Optimum, Solution, solve
+from studies.fitting.solve import Optimum, Solution, solve, weigh
 from studies.fitting.spec import FitSpec
 from studies.fitting.statistics import Answer, Misfit, misfit, rivals
-from studies.publish import shown
+from studies.job import Job
+from studies.result import Result
 from studies.study.paths import set_values
 from studies.study.spec import Study, parse_study
 from studies.study.window import with_own_window
-from studies.threads import serial_blas
 
 #: Parameters up to which all likelihoods are profiled.
 PROFILED = 6
@@ -33,8 +31,11 @@ PROFILED = 6
 MACHINES = 64
 
 
-class Fitted(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Fitted(Result):
     """A finished fit."""
+
+    FILES = "; fitted.toml is the fitted study, fitted_tune.toml a tuning for machines like it"
 
     spec: FitSpec
     problem: Problem
@@ -54,68 +55,53 @@ class Fitted(NamedTuple):
     remedies: tuple[Remedy, ...] = ()  # of a misfit, the most effective first
     is_diagnosed: bool = False  # whether remedies were sought
 
-    def _repr_html_(self) -> str:
-        return shown(self)
-
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters."""
         return self.spec.free.names
 
 
-def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
-    """Fit a model to measurements.
-
-    Args:
-        spec: from `load_fit`.
-        console: where progress goes; default: nowhere.
-
-    Raises:
-        StudyError: data that cannot be used, or no starting point that leads to a fit.
-    """
-    phases = Phases(console or Console(quiet=True), fit_phases(spec))
-    # many small matrices: two threads of BLAS take 1.6 times as long
-    with phases, serial_blas():
-        return suggest(estimate(spec, phases), phases)
+def fit_phases(spec: FitSpec) -> dict[str, float]:
+    """What is done, with what it takes on two cores [s]."""
+    samples = {"sample": 60.0} if spec.fit.samples else {}
+    first = {"fit": 30.0, "profile": 15.0, "machines": 15.0, **samples, "check": 5.0}
+    return {**first, "draw": 8.0, "next experiment": 20.0}
 
 
-def fit_phases(spec: FitSpec) -> tuple[str, ...]:
-    """Names of the phases of a fit that is written."""
-    samples = ("sample",) if spec.fit.samples else ()
-    return ("fit", "profile", "machines", *samples, "check", "draw", "next experiment")
-
-
-def estimate(spec: FitSpec, phases: Phases | None = None) -> Fitted:
+def estimate(spec: FitSpec, job: Job) -> Fitted:
     """Fit a model to measurements, without the next experiment.
 
     Args:
         spec: from `load_fit`.
-        phases: with those of `fit_phases`; default: shown nowhere.
+        job: with `fit_phases`.
 
     Raises:
-        StudyError: as `fit`.
+        StudyError: as `studies.fit`.
     """
-    fit, phases = spec.fit, phases or Phases(Console(quiet=True), fit_phases(spec))
+    fit = spec.fit
     if fit.samples:
         load_blackjax()
-    phases.begin("fit")
+    job.begin("fit")
     bench = make_bench(spec)
     every = make_measurements(spec, bench)
     problem = make_problem(spec, bench, every)
     kept = problem.measurements
     check_sanity(kept, guess(spec))
-    _check(problem, phases, fit.starts)
-    solution = solve(problem, fit.starts, fit.refine, fit.iterations, fit.seed)
-    phases.begin("profile", "the likelihood")
-    has_all = fit.profile and len(spec.free.numbers) <= PROFILED
-    answer, profiles = describe_confirmed(problem, solution.best.u, has_all)
-    phases.begin("machines", f"{MACHINES} that the data leave possible")
-    places = draw_machines(problem, solution, MACHINES, fit.seed)
+    _check(problem, job, fit.starts)
+    asked = fit.starts, fit.refine, fit.iterations, fit.seed
+    solution = job.part("fit", lambda: solve(problem, *asked))
+    weigh(problem, solution.weighed)
+    job.begin("profile", "the likelihood")
+    has_all, best = fit.profile and len(spec.free.numbers) <= PROFILED, solution.best.u
+    answer, profiles = job.part("profile", lambda: describe_confirmed(problem, best, has_all))
+    job.begin("machines", f"{MACHINES} that the data leave possible")
+    places = job.part("machines", lambda: draw_machines(problem, solution, MACHINES, fit.seed))
     posterior = None
     if fit.samples:
-        phases.begin("sample", f"{fit.samples} from the posterior")
-        posterior = sample(problem, shape(answer), fit.samples, fit.seed)
-    phases.begin("check")
+        job.begin("sample", f"{fit.samples} from the posterior")
+        about = shape(answer)
+        posterior = job.part("sample", lambda: sample(problem, about, fit.samples, fit.seed))
+    job.begin("check")
     checks, unpredicted = _predictable([x for x in every if x.is_checked], answer.values)
     fitted = parse_study(set_values(spec.study, named_values(spec, answer.values)))
     study = with_own_window(fitted, spec.data)
@@ -138,28 +124,30 @@ def estimate(spec: FitSpec, phases: Phases | None = None) -> Fitted:
     )
 
 
-def suggest(fitted: Fitted, phases: Phases) -> Fitted:
+def suggest(fitted: Fitted, job: Job) -> Fitted:
     """The same with the next experiment, or with the reason why there is none."""
     if not fitted.answer.is_explained:  # a wrong model does not know what it would learn
-        phases.begin("next experiment", "none for a wrong model; what would mend it")
-        remedies = diagnose(fitted.spec, fitted.problem, fitted.solution.best.u)
-        return fitted._replace(remedies=remedies, is_diagnosed=True)
-    phases.begin("next experiment")
+        job.begin("next experiment", "none for a wrong model; what would mend it")
+        best = fitted.solution.best.u
+        remedies = job.part("remedies", lambda: diagnose(fitted.spec, fitted.problem, best))
+        return replace(fitted, remedies=remedies, is_diagnosed=True)
+    job.begin("next experiment")
+    arguments = (
+        fitted.problem.bench,
+        fitted.problem.free,
+        fitted.answer.place,
+        fitted.answer.covariance,
+        [x.u for x in fitted.rivals],
+        fitted.spec.fit.next,
+    )
     try:
-        found = next_experiments(
-            fitted.problem.bench,
-            fitted.problem.free,
-            fitted.answer.place,
-            fitted.answer.covariance,
-            [x.u for x in fitted.rivals],
-            fitted.spec.fit.next,
-        )
-        return fitted._replace(experiments=tuple(found))
+        found = job.part("next experiment", lambda: tuple(next_experiments(*arguments)))
+        return replace(fitted, experiments=found)
     except (StudyError, ArithmeticError, ValueError) as error:  # LinAlgError is a ValueError
-        return fitted._replace(experiment_fault=str(error))
+        return replace(fitted, experiment_fault=str(error))
 
 
-def _check(problem: Problem, phases: Phases, starts: int) -> None:
+def _check(problem: Problem, job: Job, starts: int) -> None:
     """Refuse data too large or too few for the parameters.
 
     Raises:
@@ -180,7 +168,7 @@ def _check(problem: Problem, phases: Phases, starts: int) -> None:
             f"fit: {count} measured numbers and {priors} known beforehand for {size} parameters; "
             "allowed: as many or more. Fix some, or give mean and sigma of what is known"
         )
-    phases.say(f"{count} measured numbers, {size} parameters; {starts} starting points")
+    job.say(f"{count} measured numbers, {size} parameters; {starts} starting points")
 
 
 def _predictable(

@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
-
-from rich.console import Console
 
 from studies.engine.folder import FIT
-from studies.engine.progress import Phases
 from studies.engine.run_data import run_attributes
 from studies.fitting import plots
 from studies.fitting.document import fit_document, fit_variables
-from studies.fitting.estimate import Fitted, estimate, fit_phases, suggest
-from studies.fitting.say import say, value_rows
+from studies.fitting.estimate import Fitted, estimate, suggest
+from studies.fitting.say import say
 from studies.fitting.spec import FitSpec
 from studies.fitting.statistics import REGION
-from studies.publish import REPORT, announce, check_folder, publish
+from studies.job import Job
+from studies.publish import REPORT, publish
+from studies.result import in_folder
 from studies.results.document import json_text
-from studies.show.listing import print_rows
 from studies.show.pages import page, write_report
-from studies.show.report import print_result
 from studies.store import write_store
 from studies.study.template import study_template
 from studies.threads import serial_blas
 
+#: Modules that determine the numbers, with everything they import.
+DECISIVE = ("studies.fitting.estimate",)
 #: Least gain margin of that tuning [1].
 MARGIN = 2.0
 #: Comment in that file.
@@ -35,41 +33,35 @@ UNEXPLAINED = (
 STUDY, TUNE, DATA, DOCUMENT = "fitted.toml", "fitted_tune.toml", FIT, "fit.json"
 
 
-def run_fit(
-    spec: FitSpec, out: str | Path, console: Console | None = None, has_pdf: bool = False
-) -> Fitted:
-    """Fit, and write the answer into a folder.
+def fitted_into(spec: FitSpec, job: Job, has_pdf: bool = False) -> Fitted:
+    """Fit, and write the answer if the job has a folder.
 
     Args:
         spec: from `load_fit`.
-        out: folder for the files, created if missing.
-        console: where messages go; default: standard output.
+        job: with `fit_phases`.
         has_pdf: also write the figures as PDF.
 
     Raises:
-        StudyError: as `fit`, or a folder that cannot be written to.
+        StudyError: as `studies.fit`.
     """
-    out, console = Path(out), console or Console(highlight=False, markup=False)
-    check_folder(out)
     # many small matrices: two threads of BLAS take 1.6 times as long
-    with Phases(console, fit_phases(spec)) as phases, serial_blas():
-        fitted = estimate(spec, phases)
-        phases.begin("draw")
+    with serial_blas():
+        fitted = estimate(spec, job)
+        if job.folder is None:
+            return suggest(fitted, job)
+        out = job.folder
+        job.begin("draw")
         images = [f"{x}.{kind}" for x in plots.NAMES for kind in ("png", "pdf")]
         with publish(out, [DOCUMENT, *images]) as staging:
             (staging / STUDY).write_text(study_template(fitted.study), encoding="utf-8")
             (staging / TUNE).write_text(_tuning(fitted), encoding="utf-8")
             write_store(staging / DATA, fit_variables(fitted), run_attributes(fitted.study))
             write_report(say(fitted), staging, has_pdf)
-        fitted = suggest(fitted, phases)
+        fitted = suggest(fitted, job)
         with publish(out) as staging:  # only now is there a document: the answer is complete
-            (staging / REPORT).write_text(page(report := say(fitted), out), encoding="utf-8")
+            (staging / REPORT).write_text(page(say(fitted), out), encoding="utf-8")
             (staging / DOCUMENT).write_text(json_text(fit_document(fitted)), encoding="utf-8")
-    print_result(report, console)
-    print_rows(value_rows(fitted), console)
-    more = f"; {STUDY} is the fitted study, {TUNE} a tuning for machines like it"
-    announce(console, out / REPORT, more)
-    return fitted
+    return in_folder(fitted, out)
 
 
 def machines(fitted: Fitted) -> dict[str, list[float]]:

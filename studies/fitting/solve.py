@@ -42,6 +42,7 @@ class Solution(NamedTuple):
 
     optima: tuple[Optimum, ...]
     rated: int  # starting points
+    weighed: np.ndarray  # place at which the measurements' weights were found, (p,)
 
     @property
     def best(self) -> Optimum:
@@ -91,13 +92,19 @@ def solve(problem: Problem, starts: int, refine: int, iterations: int, seed: int
     order = np.argsort(problem.costs(np.array(images).reshape(-1, len(own))))
     best = [images[k] for k in order[: EXCHANGED * refine]]
     optima = distinct(optima + descend_all(problem, best, iterations))
-    for one in problem.measurements:
-        one.reweigh(problem.free.values(optima[0].u))
+    weighed = optima[0].u
+    weigh(problem, weighed)
     # away from the bounds, along which the method may have crept
     near = [x for k, x in enumerate(optima) if k < refine or x.cost - optima[0].cost < NEAR]
     inner = [np.clip(x.u, AWAY, 1 - AWAY) for x in near]
     optima = distinct(descend_all(problem, inner, iterations) or optima)
-    return Solution(tuple(optima), len(first))
+    return Solution(tuple(optima), len(first), weighed)
+
+
+def weigh(problem: Problem, u: np.ndarray) -> None:
+    """Give the measurements the weights that they have at a place, (p,)."""
+    for one in problem.measurements:
+        one.reweigh(problem.free.values(u))
 
 
 def exchanges(

@@ -6,6 +6,7 @@ SI units unless their names say otherwise.
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -350,6 +351,17 @@ class FitSpec(NamedTuple):
     entries: tuple[Common, ...]
     folder: Path  # where the files of the data are
     data: dict[str, Any]  # as read, for the record
+
+    def data_files(self) -> dict[str, str]:
+        """Digests of the files with the measured data, by name; "" of those that are not there."""
+        names = {
+            entry.file.partition("::")[0] for entry in self.entries if isinstance(entry, FileEntry)
+        }
+        paths = {name: self.folder / name for name in sorted(names)}
+        return {
+            name: hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+            for name, path in paths.items()
+        }
 
 
 def load_fit(path: str | Path) -> FitSpec:

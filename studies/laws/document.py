@@ -47,8 +47,8 @@ class CandidateTuning(Labelled):
     quality: Quality = told("whether it found the best numbers")
 
 
-class LawsDocument(Labelled, command="laws", version=2):
-    """`laws.json`, written by `studies laws`: every controller of the comparison, best first."""
+class LawsDocument(Labelled, command="compare", version=2):
+    """`laws.json`, written by `studies compare`: every controller of the comparison, best first."""
 
     title: str = told("of the study")
     budget: Budget = told("of every candidate")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from studies.laws.candidates import AS_GIVEN
 from studies.laws.judging import FIGURES, MOVES, Judged, changes
 from studies.laws.ranking import RESAMPLES, Ranking, geometric_mean, rank
 from studies.laws.tuning import Budget, Tuned
-from studies.publish import shown
+from studies.result import Result
 from studies.results.labelled import Labelled, told, unwritten
 from studies.study.entries import controlled_links
 from studies.study.margin import ENOUGH, margin_text
@@ -43,7 +43,8 @@ class Combination(Labelled):
     n_free: int = told("numbers it was tuned by")
 
 
-class LawFindings(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class LawFindings(Result):
     """Everything that a comparison found."""
 
     study: Study  # the design
@@ -53,9 +54,6 @@ class LawFindings(NamedTuple):
     tuned: list[Tuned]  # all candidates
     judged: Judged
     rankings: dict[str, Ranking]  # by metric of FIGURES, of the controllers in the competition
-
-    def _repr_html_(self) -> str:
-        return shown(self)
 
     @property
     def competing(self) -> list[int]:
@@ -113,7 +111,7 @@ def find(
     rankings = {
         name: rank(_complete(judged, judged.metrics[name])[rows], budget.seed) for name in FIGURES
     }
-    return findings._replace(rankings=rankings)
+    return replace(findings, rankings=rankings)
 
 
 def _complete(judged: Judged, figure: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""`studies laws`: tune every candidate, judge all, rank them, write the page.
+"""`studies compare`: tune every candidate, judge all, rank them, write the page.
 
 `tuning/` has the progress of each tuning and `runs/` the sweep that judges, so that an interrupted
 comparison goes on where it was. `request.json` says what was asked for.
@@ -10,20 +10,13 @@ import re
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Event, Lock
+from typing import TYPE_CHECKING
 
-from rich.console import Console
-
-from studies import config
-from studies.engine.folder import (
-    COMPARISONS,
-    keep_request,
-    locked_folder,
-    make_manifest,
-    refuse_existing,
-)
-from studies.engine.progress import Phases
+from studies.cluster.connect import TIMEOUT, Place, on_workers
+from studies.cluster.runner import ClusterRunner, run_chunk
 from studies.engine.runs import resolved_study
 from studies.errors import field_error
+from studies.job import Job
 from studies.laws.candidates import drive_candidates, law_candidates
 from studies.laws.document import laws_document
 from studies.laws.findings import (
@@ -33,22 +26,23 @@ from studies.laws.findings import (
     as_given,
     combinations,
     find,
-    verdict,
 )
 from studies.laws.judging import judging_sweep, read_judged
 from studies.laws.machines import machines_of, with_noise
 from studies.laws.say import say
-from studies.laws.tuning import Budget, Tuned, make_budget, tune_candidate
+from studies.laws.tuning import Budget, Tuned, descend, make_budget, tune_candidate, tune_on_workers
 from studies.publish import publish
+from studies.result import in_folder
 from studies.results.document import json_text
-from studies.results.labelled import document
 from studies.show.pages import write_report
-from studies.space.spec import SweepSpec
 from studies.study.spec import Study
 from studies.study.template import study_template
 from studies.study.window import with_window
-from studies.sweeps.run import run_sweep, sweep_phases
+from studies.sweeps.run import swept_into
 from studies.threads import COMPILING
+
+if TYPE_CHECKING:
+    from studies.cluster.remote import Remote
 
 DOCUMENT, TUNING, RUNS = "laws.json", "tuning", "runs"
 #: Machines to judge on.
@@ -57,44 +51,19 @@ MACHINES = 16
 TOGETHER = 2
 
 
-def run_laws(
-    study: Study,
-    out: str | Path,
-    voltage: float | None = None,
-    margin: float = 0.4,
-    is_resumed: bool = False,
-    console: Console | None = None,
-    is_quiet: bool = False,
-) -> LawFindings:
-    """Compare all laws and drives on a design's machine.
+def prepared(study: Study, voltage: float | None, margin: float) -> tuple[Study, Budget]:
+    """The design to compare with, and the budget of all candidates.
 
     Args:
-        study: the design, with sampled feedback.
-        out: folder.
-        voltage: largest of an actuator [V]; None: what the design itself needs in its motion.
-        margin: least disk margin [1].
-        is_resumed: continue an interrupted comparison.
-        console: where progress goes; default: standard output.
-        is_quiet: hide progress.
+        study: the design.
+        voltage, margin: as in `studies.compare`.
 
     Raises:
-        StudyError: a fault of the design, a limit or the folder; no candidate can be tuned.
-        KeyboardInterrupt: Ctrl-C; what is finished stays.
+        StudyError: no sampled controller, a limit out of range, or a design that cannot run.
     """
-    config.require_configured()
-    out, console = Path(out), console or Console(highlight=False, markup=False)
     _check_design(study)
     study = with_noise(with_window(resolved_study(study)))
-    budget = make_budget(study, voltage, margin)
-    with locked_folder(out, "comparison"):
-        refuse_existing(out, COMPARISONS, is_resumed)
-        request = make_manifest(study.model_dump(mode="json"), DECISIVE) | document(budget)
-        limits = dict.fromkeys(document(budget), "budget")
-        checked = {"spec": "design", "code": "program"} | limits
-        keep_request(out / COMPARISONS.mark, request, checked)
-        names = ("tune", *sweep_phases(_empty_sweep(study)), "rank", "draw")
-        with Phases(console, names, is_quiet) as phases:
-            return _compare(study, out, budget, phases)
+    return study, make_budget(study, voltage, margin)
 
 
 def _check_design(study: Study) -> None:
@@ -121,38 +90,53 @@ DECISIVE = (
 )
 
 
-def _empty_sweep(study: Study) -> SweepSpec:
-    return judging_sweep(study, [study], machines_of(study, 1, 0))
+#: What is done, with what it takes on two cores [s].
+PHASES = {"tune": 900.0, "compile": 30.0, "run": 120.0, "join": 5.0, "rank": 5.0, "draw": 10.0}
 
 
-def _compare(study: Study, out: Path, budget: Budget, phases: Phases) -> LawFindings:
-    tuned = _tune(study, out, budget, phases)
-    entries = [
-        as_given(WITHOUT, study.uncontrolled()),
-        as_given(GIVEN, study),
-        *combinations(study, tuned),
-    ]
-    machines = machines_of(study, MACHINES, budget.seed + 1)
-    spec = judging_sweep(study, [entry.study for entry in entries], machines)
-    is_begun = (out / RUNS).exists()
-    if run_sweep(spec, out / RUNS, is_begun, phases=phases).is_interrupted:
-        raise KeyboardInterrupt
-    phases.begin("rank")
-    judged = read_judged(out / RUNS, len(entries), MACHINES)
+def compared(
+    study: Study, budget: Budget, job: Job, workers: Place = None, timeout: float = TIMEOUT
+) -> LawFindings:
+    """Tune every candidate, judge all, rank them, and write the page.
+
+    Args:
+        study, budget: from `prepared`.
+        job: with `PHASES`.
+        workers, timeout: as in `studies.compare`.
+
+    Raises:
+        StudyError: no candidate can be tuned.
+    """
+    with on_workers(workers, timeout, job.say, descend, run_chunk) as remote:
+        tuned = _tune(study, budget, job, remote)
+        entries = [
+            as_given(WITHOUT, study.uncontrolled()),
+            as_given(GIVEN, study),
+            *combinations(study, tuned),
+        ]
+        machines = machines_of(study, MACHINES, budget.seed + 1)
+        spec = judging_sweep(study, [entry.study for entry in entries], machines)
+        with job.inside(RUNS) as judging:
+            swept_into(spec, judging, runner=ClusterRunner(spec, remote) if remote else None)
+    job.begin("rank")
+    judged = read_judged(job.place / RUNS, len(entries), MACHINES)
     findings = find(study, budget, tuned, judged, entries)
-    phases.begin("draw")
-    _write(findings, out)
-    for line in verdict(findings):
-        phases.say(line)
-    return findings
+    job.begin("draw")
+    _write(findings, job.place)
+    return in_folder(findings, job.place)
 
 
-def _tune(study: Study, out: Path, budget: Budget, phases: Phases) -> list[Tuned]:
+def _tune(study: Study, budget: Budget, job: Job, remote: Remote | None) -> list[Tuned]:
     """Each candidate, tuned or not; some side by side."""
-    phases.begin("tune", "what each law and drive can be tuned by")
+    job.begin("tune", "what each law and drive can be tuned by")
     candidates = [*law_candidates(study), *drive_candidates(study)]
-    folder, lock, stop, done = out / TUNING, Lock(), Event(), list[Tuned]()
+    folder, lock, stop, done = job.place / TUNING, Lock(), Event(), list[Tuned]()
     folder.mkdir(exist_ok=True)
+    files = [folder / f"{_slug(candidate.name)}.npz" for candidate in candidates]
+    if remote is not None:
+        job.say(f"workers: {remote.n_workers}; each tunes one candidate at a time")
+        for count, k in enumerate(tune_on_workers(study, candidates, budget, files, remote), 1):
+            job.advance(count, len(candidates), f"{candidates[k].name}: tuned")
 
     def tune(k: int) -> Tuned:
         candidate = candidates[k]
@@ -162,11 +146,9 @@ def _tune(study: Study, out: Path, budget: Budget, phases: Phases) -> list[Tuned
                 raise KeyboardInterrupt
             with lock:
                 here = f"{candidate.name} ({k + 1} of {len(candidates)})"
-                phases.advance(len(done), len(candidates), f"{here}: {text}")
+                job.advance(len(done), len(candidates), f"{here}: {text}")
 
-        say("compile")
-        file = folder / f"{_slug(candidate.name)}.npz"
-        one = tune_candidate(study, candidate, budget, file, say)
+        one = tune_candidate(study, candidate, budget, files[k], say)
         done.append(one)
         return one
 

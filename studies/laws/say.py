@@ -58,7 +58,7 @@ def say(findings: LawFindings) -> Report:
         question=f"""which control law should this machine have, if all of them may use the same
         voltage ({budget.voltage:.4g} V) and must keep the same disk margin
         ({budget.margin:.3g})?""",
-        next_steps="""each tuned controller is a study file in this folder: `studies spillover`
+        next_steps="""each tuned controller is a study file in this folder: `studies certify`
         certifies it, `studies export` writes it for a real-time controller.""",
         top=[drawing(plots.comparison, findings, name="laws"), drawing(plots.grid, findings)],
         chapters=[

@@ -1,14 +1,17 @@
 """Each candidate tuned to one budget: as little residual vibration as it can under equal limits.
 
 The same largest voltage, the same disk margin, as many starting points and iterations. A tuning is
-kept in its own file after every iteration, so that an interrupted comparison continues there.
+kept in its own file after every iteration, on workers once it has ended, so that an interrupted
+comparison continues there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -22,9 +25,12 @@ from studies.study.labels import describe
 from studies.study.spec import Study
 from studies.tuning.check import tuned_study
 from studies.tuning.folder import load_progress, save_progress
-from studies.tuning.optimise import Progress, is_compatible, optimise
+from studies.tuning.optimise import Progress, has_ended, is_compatible, optimise
 from studies.tuning.run import make_evaluator
 from studies.tuning.spec import TuneSpec, parse_tuning
+
+if TYPE_CHECKING:
+    from studies.cluster.remote import Remote
 
 #: The limit on the loop.
 MARGIN = "disk_margin"
@@ -182,13 +188,72 @@ def _optimised(
     spec: TuneSpec, before: Progress | None, file: Path, say: Callable[[str], None]
 ) -> Progress:
     """Progress at the end of a tuning, which its file keeps."""
+    if before is not None and has_ended(spec, before):
+        return before
 
     def keep(at: Progress) -> None:
         save_progress(file, at)
         best = at.best_objective[at.winner(0)]
         say(f"{int(at.iteration)}/{spec.tune.iterations}: {best:.3f} of the design's residual")
 
+    say("compile")
     return optimise(spec, make_evaluator(spec), before, keep)
+
+
+def tune_on_workers(
+    study: Study, candidates: list[Contender], budget: Budget, files: list[Path], remote: Remote
+) -> Iterator[int]:
+    """Bring the files of candidates to their ends, each by one call, for `tune_candidate` to read.
+
+    Args:
+        study: the design.
+        candidates: what is tuned.
+        budget: what each may spend.
+        files: of their progress.
+        remote: the workers.
+
+    Yields:
+        The position of each candidate that has been tuned.
+
+    Raises:
+        StudyError: a file is damaged, a call is given up, or as `Remote.map`.
+    """
+
+    def jobs() -> Iterator[tuple[int, tuple[str, Progress | None]]]:
+        for k, candidate in enumerate(candidates):
+            at = load_progress(files[k])
+            with suppress(StudyError):  # `tune_candidate` gives the reason
+                spec = tuning_of(study, candidate, budget)
+                if at is None or (is_compatible(spec, at) and not has_ended(spec, at)):
+                    yield k, (json.dumps(spec.data), at)
+
+    with closing(remote.map(descend, jobs())) as answered:
+        for k, answer in answered:
+            if isinstance(answer, str):
+                raise StudyError(
+                    f"{candidates[k].name} cannot be tuned: {answer}; finished tunings are safe; "
+                    "continue with --resume"
+                )
+            if answer is not None:
+                save_progress(files[k], answer)
+            yield k
+
+
+def descend(spec: str, before: Progress | None) -> Progress | None:
+    """Tune a candidate to the end, on a worker.
+
+    Args:
+        spec: the tuning as JSON.
+        before: where to go on; None: at the beginning.
+
+    Returns:
+        Its progress; None if it fails, for reasons that `tune_candidate` finds again.
+    """
+    tuning = parse_tuning(json.loads(spec))
+    try:
+        return optimise(tuning, make_evaluator(tuning), before, lambda _: None)
+    except StudyError:
+        return None
 
 
 def _violated(spec: TuneSpec, at: Progress, best: int) -> str:

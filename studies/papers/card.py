@@ -7,9 +7,11 @@ from the run and from nothing else.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from studies.engine.batches import ProgressCallback
+from studies.job import Job
+from studies.result import Result
 from studies.results.labelled import Labelled, Variable, told
 from studies.show.listing import Rows
 from studies.show.report import Report
@@ -56,15 +58,27 @@ def outcome_of(is_met: bool) -> str:
     return HOLDS if is_met else FAILS
 
 
-class CardResult(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class CardResult(Result):
     """What the study of a card found, and how it is written."""
 
+    FILES = "; data, tables and figures in the same folder"
+
+    outcome: PaperOutcome
     study: Study  # baseline
-    verdicts: list[Verdict]  # of the card's claims, in their order
     tables: dict[str, Rows]  # by name of their CSV file
-    report: Report
+    page: Report
     # runs by name of their HDF5 file: their study and variables
-    stores: Mapping[str, tuple[Study, dict[str, Variable]]] = {}
+    stores: Mapping[str, tuple[Study, dict[str, Variable]]] = field(default_factory=dict)
+
+    def document(self) -> PaperOutcome:
+        return self.outcome
+
+    def report(self) -> Report:
+        return self.page
+
+    def variables(self) -> dict[str, Variable]:
+        return dict(next(iter(self.stores.values()))[1])
 
 
 class PaperCard(NamedTuple):
@@ -76,5 +90,4 @@ class PaperCard(NamedTuple):
     read: str  # what of it could be read
     claims: tuple[Claim, ...]
     left_open: tuple[str, ...]  # numbers that a reader would need and the paper does not give
-    work: float  # sum of the shares that `run` reports
-    run: Callable[[ProgressCallback], CardResult]
+    run: Callable[[Job], CardResult]

@@ -21,10 +21,13 @@ def find_card(name: str) -> PaperCard:
     Raises:
         StudyError: there is none.
     """
+    if not name:
+        notebooks = "; ".join(f"{paper}: {notebook}" for paper, notebook in NOTEBOOKS.items())
+        raise StudyError(f"WHAT: missing; allowed: {', '.join(CARDS)}. Notebooks: {notebooks}")
     if name in NOTEBOOKS:
-        raise StudyError(f"NAME = {name!r}: no card; see {NOTEBOOKS[name]}")
+        raise StudyError(f"WHAT = {name!r}: no card; see {NOTEBOOKS[name]}")
     if name not in CARDS:
         papers = [*CARDS, *NOTEBOOKS]
         begun = next((paper for paper in papers if name and paper.startswith(name.lower())), "")
-        raise field_error("NAME", name, ", ".join(CARDS), hint=begun or nearest(name, papers))
+        raise field_error("WHAT", name, ", ".join(CARDS), hint=begun or nearest(name, papers))
     return CARDS[name]

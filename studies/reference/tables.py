@@ -12,6 +12,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+#: Bare links of given length under half the paper's gains, as the tables and workloads have them.
+BARE: dict[str, Any] = {
+    "link__basis": "pinned_pinned",
+    "link__stretch": False,
+    "control__basis": "pinned_pinned",
+    "control__velocity_gain": (1.55, 1.75, 1.7),
+}
+
 _FOLDER = Path(__file__).parent / "data"
 
 #: What holds the sliders in the table of frequencies, as changes to a study.

@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from jaxmodel import status
-from studies.engine.progress import Phases, duration_text
+from studies.phases import Phases, duration_text
 from studies.screen.shards import ScreenRequest, shard_tally, table_of
 from studies.screen.tally import LEFT_OUT, Tally
 from studies.space.table import CaseTable

@@ -1,34 +1,26 @@
-"""`studies screen`: runs the shards that are left, here or on workers, and keeps the tally."""
+"""Runs the shards of a screen that are left, here or on workers, keeps the tally, and chooses."""
 
 from __future__ import annotations
 
-import threading
-import time
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from rich.console import Console
 
 from jaxmodel import status
-from studies import config
-from studies.cluster.connect import Place, on_workers
-from studies.engine.fidelity import TRIED, Agreement, agreement
-from studies.engine.folder import locked_folder
-from studies.engine.progress import Phases, duration_text, interrupts
-from studies.screen.local import LocalScreener, Screener, ScreenProgress, ShardWork
-from studies.screen.selection import Selection, select, uncontrolled
-from studies.screen.shards import ScreenRequest, designs_table
-from studies.screen.stored import begin, write_best, write_tally
+from studies.engine.fidelity import Agreement, agreement
+from studies.errors import StudyError
+from studies.job import Job
+from studies.phases import interrupts
+from studies.screen.local import Screener, ScreenProgress, ShardWork
+from studies.screen.selection import Selection, select
+from studies.screen.shards import ScreenRequest
+from studies.screen.stored import begin, write_tally
 from studies.screen.tally import LEFT_OUT, Tally, merged
-from studies.screen.workers import ClusterScreener
 from studies.show.units import count_text
 from studies.study.labels import remedy
+from studies.study.margin import margin_text
 
-#: From so many designs on, workers of this machine are worth their start.
-LARGE = 10**6
-
-PHASES = ("screen", "margins", "report")
+PHASES = ("screen", "margins")
 
 
 class ScreenOutcome(NamedTuple):
@@ -38,89 +30,57 @@ class ScreenOutcome(NamedTuple):
     is_done: np.ndarray  # by shard
     tally: Tally
     lost: dict[int, str]  # shards that were given up, and why
-    is_interrupted: bool  # by Ctrl-C
-    selection: Selection | None  # of the candidates; None: interrupted, or there are none
-    uncontrolled: float | None  # the metric without control; None: not known
-    agreement: Agreement | None = None  # of linear and full model; None: not of the linear one
+    agreement: Agreement | None  # of linear and full model; None: not of the linear one
+    selection: Selection | None = None  # of the candidates; None: not chosen, or there are none
 
     @property
     def n_kept(self) -> int:
-        """Number of cases of `best.toml`."""
-        return 0 if self.selection is None else int(self.selection.is_kept.sum())
+        """Number of designs that are chosen."""
+        return len(chosen(self).kept_value)
 
 
-def run_screen(
-    screen: ScreenRequest,
-    out: str | Path,
-    is_quiet: bool = False,
-    workers: Place = None,
-    phases: Phases | None = None,
-    screener: Screener | None = None,
-) -> ScreenOutcome:
-    """Run what is left of a screen into a folder.
+def chosen(done: ScreenOutcome) -> Selection:
+    """The candidates that were judged, once that was not interrupted."""
+    assert done.selection is not None
+    return done.selection
+
+
+def run_screen(screen: ScreenRequest, job: Job, screener: Screener) -> ScreenOutcome:
+    """Run what is left of a screen.
 
     Args:
         screen: from `screen_of`.
-        out: its folder; one that was begun is gone on with.
-        is_quiet: hide progress.
-        workers: as in `run_sweep`.
-        phases: of a longer command, with those of `PHASES`, in place of is_quiet.
-        screener: of the shards, in place of workers.
+        job: with `PHASES`.
+        screener: of the shards.
 
     Returns:
-        ScreenOutcome; `best.toml` is there unless the run was interrupted or nothing is kept.
+        ScreenOutcome; nothing is chosen yet.
 
     Raises:
         StudyError: a fault of the sweep, the folder or the disk. Finished shards stay.
+        KeyboardInterrupt: the same.
     """
-    config.require_configured()
-    if phases is None:
-        with Phases(Console(highlight=False, markup=False), PHASES, is_quiet) as phases:
-            return run_screen(screen, out, False, workers, phases, screener)
-    is_large = screen.n_designs >= LARGE
-    with on_workers(workers, is_large, phases.say, ClusterScreener, screener) as found:
-        return _run_rest(screen, Path(out), found or LocalScreener(), phases)
-
-
-def _run_rest(
-    screen: ScreenRequest, out: Path, screener: Screener, phases: Phases
-) -> ScreenOutcome:
     lost: dict[int, str] = {}
-    with locked_folder(out, "screen"), interrupts() as stop:
-        is_done, tally = begin(out, screen)
-        left = np.flatnonzero(~is_done).tolist()
-        phases.begin(
-            "screen", f"{screen.n_designs:,} designs in {count_text(screen.n_shards, 'shard')}"
-        )
-        agreed = _agreement(screen)
-        progress = ScreenProgress(phases, screen.n_designs, tally.n_designs)
+    is_done, tally = begin(job.place, screen)
+    left = np.flatnonzero(~is_done).tolist()
+    shards = count_text(screen.n_shards, "shard")
+    job.begin("screen", f"{screen.n_designs:,} designs in {shards}")
+    agreed = _agreement(screen)
+    progress = ScreenProgress(job.phases, screen.n_designs, tally.n_designs)
+    with interrupts() as stop:
         for shard, answer in screener.tallies(ShardWork(screen, left, progress, stop)):
             if isinstance(answer, str):
                 lost[shard] = answer
-                phases.say(f"shard {shard} is left out: {answer}")
+                job.say(f"shard {shard} is left out: {answer}")
                 continue
             if not is_done.any() and (advice := all_failed(answer)):
-                phases.say(f"none of the first designs ended well: {advice}")
+                job.say(f"none of the first designs ended well: {advice}")
             tally = merged(tally, answer, *screen.ranking)
             is_done[shard] = True
-            write_tally(out, screen, is_done, tally)
-        selection, without = None, None
-        if not stop.is_set() and len(tally.row):
-            selection = _selected(screen, tally, stop, phases)
-        is_interrupted = stop.is_set() and selection is None
-        if selection is not None:
-            without = uncontrolled(screen, selection.table)
-            write_best(out, screen, selection.kept)
-    return ScreenOutcome(
-        screen=screen,
-        is_done=is_done,
-        tally=tally,
-        lost=lost,
-        is_interrupted=is_interrupted,
-        selection=selection,
-        uncontrolled=without,
-        agreement=agreed,
-    )
+            write_tally(job.place, screen, is_done, tally)
+    if stop.is_set():
+        raise KeyboardInterrupt(f"{tally.n_designs:,} of {screen.n_designs:,} designs are safe")
+    return ScreenOutcome(screen=screen, is_done=is_done, tally=tally, lost=lost, agreement=agreed)
 
 
 def _agreement(screen: ScreenRequest) -> Agreement | None:
@@ -129,14 +89,11 @@ def _agreement(screen: ScreenRequest) -> Agreement | None:
     Raises:
         StudyError: it does not.
     """
-    if screen.spec.sweep.fidelity != "linear":
+    if not screen.is_linear:
         return None
-    rng, n = np.random.default_rng(screen.spec.sweep.seed), screen.n_designs
-    rows = rng.permutation(n) if n < 100 * TRIED else np.unique(rng.integers(0, n, 2 * TRIED))
-    table = designs_table(screen, np.sort(rows[: 2 * TRIED]))
-    found = agreement(screen.spec, table, screen.by)
+    found = agreement(screen.spec, screen.some, screen.spec.sweep.by)
     if found is not None:
-        found.check("Rank by another metric, or screen with --fidelity full.")
+        found.check('Rank by another metric, or find the best with fidelity = "full".')
     return found
 
 
@@ -150,17 +107,24 @@ def all_failed(tally: Tally) -> str:
     return "; ".join(reasons + [advice for advice in map(remedy, codes[:1]) if advice])
 
 
-def _selected(
-    screen: ScreenRequest, tally: Tally, stop: threading.Event, phases: Phases
-) -> Selection | None:
-    phases.begin("margins", f"of {count_text(len(tally.row), 'candidate')}, best first")
-    wanted = f", {{:,}} with a gain margin of at least {screen.margin:g}" if screen.margin else ""
-    began = time.perf_counter()
+def choose(found: ScreenOutcome, count: int, job: Job) -> ScreenOutcome:
+    """With the best `count` candidates that have the margin asked for, if so many have it.
 
-    def tell(n_judged: int, n_kept: int, total: int) -> None:
-        needed = min(total, n_judged * screen.keep / max(n_kept, 1))
-        rest = (time.perf_counter() - began) * max(needed / n_judged - 1, 0)
-        text = f"{n_judged:,} of {total:,} judged{wanted.format(n_kept)}"
-        phases.advance(n_judged, total, text, f"about {duration_text(rest)}")
-
-    return select(screen, tally, stop, tell)
+    Raises:
+        StudyError: none has it, or there are no candidates.
+    """
+    tally, screen, least = found.tally, found.screen, found.screen.spec.sweep.margin
+    if not len(tally.row):
+        n_ok = tally.endings[status.OK]
+        why = all_failed(tally) or f"{n_ok:,} are ok, but have no finite {screen.entry}"
+        raise StudyError(f"sweep.keep: none of {tally.n_designs:,} designs to keep: {why}")
+    job.begin("margins", f"of {count_text(len(tally.row), 'candidate')}, best first")
+    selection = select(screen, tally, count, job)
+    if not selection.is_kept.any():
+        largest = margin_text(np.nanmax(selection.margin, initial=0.0))
+        raise StudyError(
+            f"sweep.margin = {least:g}: none of {len(selection.margin):,} candidates has it "
+            f"(largest: {largest}); ask for less with --resume: no design runs again; or narrow "
+            "the axes"
+        )
+    return found._replace(selection=selection)

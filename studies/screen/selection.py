@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
+import time
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxmodel import status
 from studies.engine.chunks import judge_cases
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
-from studies.engine.results import SweepData, controlled, uncontrolled_value
-from studies.engine.run_data import metric_variables
-from studies.engine.runs import run_uncontrolled
-from studies.errors import StudyError
+from studies.job import Job
+from studies.phases import duration_text
 from studies.screen.shards import ScreenRequest, designs_table
 from studies.screen.tally import Tally
 from studies.space.table import CaseTable
@@ -30,11 +26,11 @@ class Selection(NamedTuple):
     table: CaseTable  # their cases
     value: np.ndarray  # what they are ranked by, (n,)
     margin: np.ndarray  # gain margins: factors on all gains [1]; NaN: no sampled loop, (n,)
-    is_kept: np.ndarray  # which are cases of `best.toml`, (n,)
+    is_kept: np.ndarray  # which run by the full model, (n,)
 
     @property
     def kept(self) -> CaseTable:
-        """Cases of `best.toml`, best first."""
+        """Those that run by the full model, best first."""
         return self.table.rows(np.flatnonzero(self.is_kept))
 
     @property
@@ -43,45 +39,34 @@ class Selection(NamedTuple):
         return self.value[self.is_kept]
 
 
-def select(
-    screen: ScreenRequest,
-    tally: Tally,
-    stop: threading.Event,
-    on_block: Callable[[int, int, int], object] = lambda n_judged, n_kept, total: None,
-) -> Selection | None:
+def select(screen: ScreenRequest, tally: Tally, count: int, job: Job) -> Selection:
     """Judge candidates, best first, until as many as are to be kept have the margin.
 
     Args:
-        screen: says how many, and which margin.
+        screen: says which margin.
         tally: of all its designs.
-        stop: once set, no further candidates are judged.
-        on_block: called with how many are judged and kept so far, and how many there are.
-
-    Returns:
-        Selection; None if it was stopped.
+        count: how many to keep.
+        job: in its phase of the margins.
     """
-    table = designs_table(screen, tally.row)
+    table, least = designs_table(screen, tally.row), screen.spec.sweep.margin
     value = tally.value[np.isin(tally.row, table.row)]  # without those left out as duplicates
-    if not screen.margin:
-        table, value = table.rows(np.arange(min(screen.keep, len(table)))), value[: screen.keep]
-    margin = np.zeros(0)
+    if not least:
+        table, value = table.rows(np.arange(min(count, len(table)))), value[:count]
+    margin, total, began = np.zeros(0), len(table), time.perf_counter()
     has_loop = Fields(table.study, table.fields).raw("control.feedback") == "sampled"
-    has_loop, is_kept = np.broadcast_to(has_loop, len(table)), np.zeros(0, bool)
-    while len(margin) < len(table) and is_kept.sum() < screen.keep:
-        if stop.is_set():
-            return None
-        rows = np.arange(len(margin), min(len(margin) + BLOCK, len(table)))
+    has_loop, is_kept = np.broadcast_to(has_loop, total), np.zeros(0, bool)
+    while len(margin) < total and is_kept.sum() < count:
+        rows = np.arange(len(margin), min(len(margin) + BLOCK, total))
         margin = np.append(margin, _margins(screen, table.rows(rows)))
-        is_kept = (margin >= screen.margin) | ~has_loop[: len(margin)] | (screen.margin == 0)
-        on_block(len(margin), int(is_kept.sum()), len(table))
+        is_kept = (margin >= least) | ~has_loop[: len(margin)] | (least == 0)
+        n_kept, n_judged = int(is_kept.sum()), len(margin)
+        needed = min(total, n_judged * count / max(n_kept, 1))
+        rest = (time.perf_counter() - began) * max(needed / n_judged - 1, 0)
+        text = f"{n_judged:,} of {total:,} judged, {n_kept:,} with a margin of at least {least:g}"
+        job.advance(n_judged, total, text, f"about {duration_text(rest)}")
     judged = np.arange(len(margin))
-    is_kept &= np.cumsum(is_kept) <= screen.keep
-    return Selection(
-        table=table.rows(judged),
-        value=value[judged],
-        margin=margin,
-        is_kept=is_kept,
-    )
+    is_kept &= np.cumsum(is_kept) <= count
+    return Selection(table.rows(judged), value[judged], margin, is_kept)
 
 
 def _margins(screen: ScreenRequest, table: CaseTable) -> np.ndarray:
@@ -95,25 +80,3 @@ def _margins(screen: ScreenRequest, table: CaseTable) -> np.ndarray:
             figures = judge_cases(group.structure, cases)
             margin[chunk.rows] = np.asarray(figures.gain_margin)[: len(chunk.rows)]
     return margin
-
-
-def uncontrolled(screen: ScreenRequest, kept: CaseTable) -> float | None:
-    """What the designs are ranked by, of the study's machine without control.
-
-    Args:
-        screen: of the designs.
-        kept: these, best first.
-
-    Returns:
-        Value [unit of the metric]; None where there is nothing to compare, or no such run.
-    """
-    if not controlled(kept).any():
-        return None
-    try:
-        run = run_uncontrolled(screen.spec.study, is_linear=screen.spec.sweep.fidelity == "linear")
-    except StudyError:
-        return None
-    if run.status not in status.FINISHED:
-        return None
-    data = SweepData({}, {}, screen.spec, kept, metric_variables(run.result))
-    return uncontrolled_value(data, screen.entry)

@@ -9,21 +9,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxmodel.loop_figures import HIGHEST
 from studies.engine.chunks import Done, run_quietly
-from studies.engine.plan import local_layout, most_lanes, plan_groups
-from studies.engine.results import SweepData, counted_links, direction
-from studies.engine.screen import chunk_values
-from studies.engine.stored import accurate, inaccurate
-from studies.errors import StudyError, field_error
+from studies.engine.fidelity import chunk_values
+from studies.engine.plan import Group, local_layout, most_lanes, plan_groups
+from studies.engine.results import direction, links_of
+from studies.engine.stored import check_names
+from studies.errors import StudyError
 from studies.screen.tally import Axes, Tally, divided, merged, nothing, tally_of
 from studies.space.designs import LazyCases, design_of
-from studies.space.methods import METHODS
-from studies.space.spec import SweepSpec
-from studies.space.table import CaseTable, as_numbers, build_table, metric_sizes
-from studies.study.entries import parse_entries
+from studies.space.spec import CANDIDATES, SweepSpec
+from studies.space.table import CaseTable, as_numbers, build_table
 from studies.study.fields import Columns
-from studies.study.margin import ENOUGH
 
 #: Fewest and most designs of a shard.
 SHARD = (2**14, 2**18)
@@ -35,17 +31,13 @@ LANES = 512
 TRIED = 2**12
 #: Most designs.
 MOST = 10**12
-#: Best designs of a screen, whatever their margins: those to be kept are chosen among them.
-CANDIDATES = 100_000
 
 
 class ScreenRequest(NamedTuple):
-    """What is screened, and what is kept."""
+    """What is screened: the designs of a sweep that keeps some."""
 
     spec: SweepSpec  # its `links` are the same for all designs
-    by: str  # metric, or entry of one; a minus in front: the worst first
-    keep: int  # most designs kept
-    margin: float  # least gain margin of these [1]; 0: any
+    some: CaseTable  # designs in which every axis varies, the same in any process
     n_designs: int  # of the sweep
     axes: Axes
     shard_size: int  # designs; the last shard may have fewer
@@ -53,7 +45,7 @@ class ScreenRequest(NamedTuple):
     @property
     def entry(self) -> str:
         """What designs are ranked by, without the direction."""
-        return self.by.removeprefix("-")
+        return self.spec.sweep.by.removeprefix("-")
 
     @property
     def metric(self) -> str:
@@ -61,9 +53,14 @@ class ScreenRequest(NamedTuple):
         return self.entry.partition("[")[0]
 
     @property
+    def is_linear(self) -> bool:
+        """Whether the linear model finds the best designs."""
+        return self.spec.sweep.fidelity == "linear"
+
+    @property
     def ranking(self) -> tuple[int, bool]:
         """How many candidates a tally holds, and whether large values are the best."""
-        return CANDIDATES, direction(self.by) == "largest"
+        return CANDIDATES, direction(self.spec.sweep.by) == "largest"
 
     @property
     def n_shards(self) -> int:
@@ -76,64 +73,36 @@ class ScreenRequest(NamedTuple):
         return np.arange(first, min(first + self.shard_size, self.n_designs))
 
 
-def screen_of(
-    spec: SweepSpec,
-    by: str = "",
-    keep: int = 1000,
-    margin: float = ENOUGH,
-    fidelity: str = "linear",
-    shard_size: int = 0,
-) -> ScreenRequest:
-    """A screen of a sweep's designs.
+def screen_of(spec: SweepSpec, shard_size: int = 0) -> ScreenRequest:
+    """The screen of a sweep's designs.
 
     Args:
-        spec: the sweep.
-        by: metric, or entry of one; "": what the sweep ranks by.
-        keep: most designs kept.
-        margin: least gain margin of these [1]; 0: any.
-        fidelity: model of the runs, "linear" or "full".
+        spec: the sweep, with `keep`.
         shard_size: designs of a shard; 0: by their number.
 
     Raises:
-        StudyError: a sweep that cannot be screened, or a bad metric.
+        StudyError: a metric or condition that no design has, too many designs, or none.
     """
-    spec = spec._replace(sweep=spec.sweep.model_copy(update={"fidelity": fidelity}))
-    by = by or spec.sweep.by
-    if METHODS[spec.sweep.method].analysis is not None:
-        raise field_error(
-            "sweep.method", spec.sweep.method, "any that is not for studies sensitivity"
-        )
-    for name in ("repeats", "environments", "screen"):
-        value = getattr(spec.sweep, name)
-        default = type(spec.sweep).model_fields[name].default
-        if value != default:
-            raise field_error(f"sweep.{name}", value, f"{default!r} in a screen")
-    if not 1 <= keep <= CANDIDATES:
-        raise field_error("--keep", keep, f"1 to {CANDIDATES} designs")
-    if not 0 <= margin < HIGHEST:
-        raise field_error("--margin", margin, f"0 to less than {HIGHEST:g}")
     design = design_of(spec.root, spec.study, spec.sweep.seed)
     if design.size > MOST:
-        raise StudyError(f"sweep: {design.size:.3g} designs; allowed: up to {MOST:.0e} in a screen")
+        raise StudyError(
+            f"sweep: {design.size:.3g} designs; allowed: up to {MOST:.0e} with sweep.keep"
+        )
     tried = _tried(design)
-    table = build_table(spec, tried)
-    if not len(table):
+    some = build_table(spec, tried)
+    if not len(some):
         raise StudyError(
             f"sweep.where = {spec.sweep.where!r}: true for none of {len(tried)} designs tried; "
             "narrow the axes to where it holds"
         )
-    parse_entries(by.removeprefix("-"), "--by", metric_sizes(table))
-    links = (np.flatnonzero(counted_links(SweepData({}, {}, spec, table))) + 1).tolist()
+    check_names(spec, some)
+    links = (np.flatnonzero(links_of(spec, some)) + 1).tolist()
     spec = spec._replace(sweep=spec.sweep.model_copy(update={"links": tuple(links)}))
-    if inaccurate([by.removeprefix("-").partition("[")[0]]):
-        raise field_error("--by", by, f"with float32 {accurate()}")
     return ScreenRequest(
         spec=spec,
-        by=by,
-        keep=keep,
-        margin=margin,
+        some=some,
         n_designs=design.size,
-        axes=divided(_distinct(axis_columns(table))),
+        axes=divided(_distinct(axis_columns(some))),
         shard_size=shard_size or _shard_size(design.size),
     )
 
@@ -194,6 +163,18 @@ def designs_table(screen: ScreenRequest, row: np.ndarray) -> CaseTable:
     return table.rows(np.argsort(place))
 
 
+def shard_groups(screen: ScreenRequest, table: CaseTable) -> list[Group]:
+    """Designs of a table by program: one metric, no judgement."""
+    return plan_groups(
+        table,
+        np.arange(len(table)),
+        partial(local_layout, most=max(LANES, most_lanes())),
+        (screen.metric,),
+        screen.is_linear,
+        is_judged=False,
+    )
+
+
 def shard_tally(
     screen: ScreenRequest,
     shard: int,
@@ -218,13 +199,8 @@ def shard_tally(
     on_endings(total.endings)
     if not count:
         return total
-    is_linear = screen.spec.sweep.fidelity == "linear"
-    lay_out = partial(local_layout, most=max(LANES, most_lanes()))
-    groups = plan_groups(
-        table, np.arange(count), lay_out, (screen.metric,), is_linear, is_judged=False
-    )
     n_run = 0
-    for done in run_quietly(table, groups, stop):
+    for done in run_quietly(table, shard_groups(screen, table), stop):
         part = _chunk_tally(screen, table, done)
         total = merged(total, part, *screen.ranking)
         n_run += part.n_designs

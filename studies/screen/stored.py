@@ -1,31 +1,29 @@
-"""The folder of a screen: what is screened, the tally so far, and the best designs as a sweep."""
+"""What a folder keeps of a screen: the request, the tally so far, and the best as a sweep."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from studies.engine.folder import keep_request, make_manifest
+from studies.engine.folder import SCREEN
 from studies.errors import StudyError
-from studies.publish import REPORT, replacing
+from studies.job import keep_request, make_request
 from studies.results.labelled import Variables
-from studies.screen.shards import CANDIDATES, ScreenRequest
+from studies.screen.shards import ScreenRequest
 from studies.screen.tally import BUCKETS, GROWTH, LEAST, N_ENDINGS, Tally, nothing
 from studies.space.axes import LABELS
-from studies.space.spec import SPREADING
+from studies.space.spec import SELECTING, SPREADING, SweepSpec, parse_sweep
 from studies.space.table import CaseTable, as_python
 from studies.store import numbers_digest, read_store, write_store
-from studies.study.template import toml_text, toml_value
 
-REQUEST, TALLY, BEST = "screen.json", "screen.h5", "best.toml"
+TALLY = "screen.h5"
 #: What must be the same in a folder that is gone on with.
 _CHECKED = {
-    "spec": "sweep",
-    "by": "--by",
-    "fidelity": "--fidelity",
+    "screened": "sweep",
     "shard_size": "size of shards",
     "code": "program",
     "precision": "--precision",
@@ -34,7 +32,7 @@ _CHECKED = {
 
 
 def begin(folder: Path, screen: ScreenRequest) -> tuple[np.ndarray, Tally]:
-    """Begin a screen in a folder, or go on with it.
+    """Begin a screen in a folder, or go on with it; other designs may be kept by then.
 
     Args:
         folder: of the screen, locked.
@@ -46,8 +44,8 @@ def begin(folder: Path, screen: ScreenRequest) -> tuple[np.ndarray, Tally]:
     Raises:
         StudyError: the folder was begun with another screen, or its file is damaged.
     """
-    request = make_manifest(screen.spec.data, ("studies.screen.shards",)) | _asked(screen)
-    keep_request(folder / REQUEST, request, _CHECKED)
+    request = make_request(screen.spec.data, ("studies.screen.shards",)) | _asked(screen)
+    keep_request(folder / SCREEN, request, _CHECKED)
     if not (folder / TALLY).is_file():
         return np.zeros(screen.n_shards, bool), nothing(screen.axes)
     return read_tally(folder, screen)
@@ -55,48 +53,28 @@ def begin(folder: Path, screen: ScreenRequest) -> tuple[np.ndarray, Tally]:
 
 def read_tally(folder: Path, screen: ScreenRequest) -> tuple[np.ndarray, Tally]:
     """Which shards of a screen are done, and their tally; errors as `begin`."""
-    path, empty = folder / TALLY, nothing(screen.axes)
+    path = folder / TALLY
     try:
         variables, attributes = read_store(path)
         is_done = variables["is_done"].data > 0
         tally = Tally(**{name: variables[name].data for name in Tally._fields})
+        is_own = attributes["digest"] == _digest(screen, is_done, tally)
     except (StudyError, KeyError, TypeError) as error:
         raise _damaged(path, str(error).removeprefix(f"{path}: ")) from None
-    if is_done.shape != (screen.n_shards,):
-        raise _damaged(path, "number of shards")
-    for name, array in tally._asdict().items():
-        expected = getattr(empty, name)
-        kinds = "f" if name == "value" else "iu"
-        if array.dtype.kind not in kinds or array.shape[1:] != expected.shape[1:]:
-            raise _damaged(path, name)
-    n_done = sum(len(screen.rows(int(k))) for k in np.flatnonzero(is_done))
-    if (
-        tally.endings.shape != empty.endings.shape
-        or tally.sketch.shape != empty.sketch.shape
-        or np.any(tally.endings < 0)
-        or np.any(tally.sketch < 0)
-        or tally.n_designs != n_done
-    ):
-        raise _damaged(path, "numbers of designs")
-    if attributes.get("digest") != _digest(screen, is_done, tally):
-        raise _damaged(path, "not what was written for this screen")
-    is_row = (tally.row >= 0) & (tally.row < screen.n_designs)
-    if tally.row.shape != tally.value.shape or len(tally.row) > CANDIDATES or not is_row.all():
-        raise _damaged(path, "candidates")
+    if not is_own:
+        raise _damaged(path, "not what was written for these designs")
     return is_done, tally
 
 
 def _asked(screen: ScreenRequest) -> dict[str, Any]:
-    """What is asked of a screen, next to its sweep."""
-    return {
-        "by": screen.by,
-        "fidelity": screen.spec.sweep.fidelity,
-        "shard_size": screen.shard_size,
-    }
+    """What determines the tally."""
+    data = screen.spec.data
+    sweep = {name: x for name, x in data["sweep"].items() if name not in SELECTING}
+    return {"screened": {**data, "sweep": sweep}, "shard_size": screen.shard_size}
 
 
 def _digest(screen: ScreenRequest, is_done: np.ndarray, tally: Tally) -> str:
-    asked = json.dumps({"spec": screen.spec.data, **_asked(screen)}, sort_keys=True)
+    asked = json.dumps(_asked(screen), sort_keys=True)
     return numbers_digest({"is_done": is_done, "asked": asked, **tally._asdict()})
 
 
@@ -124,7 +102,7 @@ def write_tally(folder: Path, screen: ScreenRequest, is_done: np.ndarray, tally:
     found.put("ending", np.arange(N_ENDINGS), "1", text, "ending")
     attributes = {
         "title": screen.spec.study.title,
-        "by": screen.by,
+        "by": screen.spec.sweep.by,
         "n_designs": screen.n_designs,
         "digest": _digest(screen, is_done, tally),
     }
@@ -139,31 +117,23 @@ def _interval_names(screen: ScreenRequest) -> list[str]:
     ]
 
 
-def best_sweep(screen: ScreenRequest, kept: CaseTable) -> str:
-    """The kept designs as the file of a sweep, best first, whose cases have the same ids."""
+def best_sweep(screen: ScreenRequest, kept: CaseTable, earlier: Sequence[Any] = ()) -> SweepSpec:
+    """The kept designs as a sweep by the full model, best first, whose cases have the same ids.
+
+    Args:
+        screen: of the designs.
+        kept: those to keep.
+        earlier: cases that have run before, as `sweep.cases` lists them.
+    """
     data = screen.spec.data
     # it names its cases instead
-    written = {name: x for name, x in data["sweep"].items() if name not in SPREADING}
+    written = {x: y for x, y in data["sweep"].items() if x not in SPREADING | {"keep", "margin"}}
     links = list(screen.spec.sweep.links)  # also where the designs kept control fewer
-    sweep: dict[str, Any] = written | {"method": "list", "by": screen.by, "links": links}
+    sweep: dict[str, Any] = written | {"method": "list", "by": screen.entry, "links": links}
     sweep.pop("fidelity", None)
-    sections = {name: x for name, x in data.items() if name != "sweep"}
     fields = {name: x for name, x in kept.fields.items() if name not in LABELS}
     cases = [
         {name: as_python(column[k]) for name, column in fields.items()} for k in range(len(kept))
     ]
-    lines = "".join(f"  {toml_value(case)},\n" for case in cases)
-    return f"{toml_text({**sections, 'sweep': sweep})}cases = [\n{lines}]\n"
-
-
-def write_best(folder: Path, screen: ScreenRequest, kept: CaseTable) -> None:
-    """Write `best.toml`, whole or not at all, and remove what tells of an older one."""
-    for stale in (REPORT, *([] if len(kept) else [BEST])):
-        try:
-            (folder / stale).unlink(missing_ok=True)
-        except OSError as error:
-            raise StudyError(f"{folder / stale}: cannot remove it ({error.strerror})") from None
-    if not len(kept):
-        return
-    with replacing(folder / BEST) as temporary:
-        temporary.write_text(best_sweep(screen, kept), encoding="utf-8")
+    best = {**data, "sweep": sweep | {"cases": [*cases, *earlier]}}
+    return parse_sweep(json.loads(json.dumps(best)))

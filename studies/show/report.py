@@ -14,6 +14,7 @@ from typing import Any
 
 from rich.console import Console
 
+from studies.errors import field_error, nearest
 from studies.show.listing import Rows, print_rows
 from studies.study.spec import Study
 
@@ -78,6 +79,22 @@ class Report:
         """All of them, in order."""
         return [*self.top, *(x for chapter in self.chapters if chapter for x in chapter.parts)]
 
+    def lines(self) -> list[str]:
+        """The result and the caveat, a sentence a line."""
+        return [plain(text) for text in [*self.result, self.caveat] if text]
+
+    def plot(self, name: str = "") -> Any:
+        """A figure of Matplotlib, by name; default: the first.
+
+        Raises:
+            StudyError: there is none.
+        """
+        found = {x.name: x.draw for x in self.parts if isinstance(x, Drawing) and x.draw}
+        if name not in ("", *found) or not found:
+            raise field_error("name", name, ", ".join(found) or "none", hint=nearest(name, found))
+        draw = found[name] if name else next(iter(found.values()))
+        return draw()
+
 
 def chapter(title: str, *parts: Part) -> Chapter | None:
     """A heading with what is not empty of some parts; None if all are."""
@@ -131,14 +148,14 @@ def sentence(text: str) -> str:
 
 def print_result(report: Report, console: Console) -> None:
     """Print the result, a sentence a line."""
-    for text in report.result:
-        console.print(plain(text), soft_wrap=True)
+    for text in report.lines():
+        console.print(text, soft_wrap=True)
 
 
 def print_report(report: Report, console: Console) -> None:
     """Print the result, and the texts and tables below it."""
     print_result(report, console)
-    for part in [*report.parts, report.caveat]:
+    for part in report.parts:
         if isinstance(part, Rows):
             print_rows(part, console)
         elif isinstance(part, str) and part:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from studies.engine.run_data import loop_variables, result_variables
-from studies.engine.runs import Run
 from studies.results.labelled import Labelled, Variable, labelled, told
+from studies.single.run import Simulation
 from studies.study.labels import describe
 
 #: Axis of metrics that are curves: the files of runs have them.
@@ -31,8 +31,9 @@ class RunDocument(Labelled, command="simulate"):
     axes: dict[str, tuple[str, ...]] = told("of each number, outermost first; none for one number")
 
 
-def run_document(run: Run, twin: Run | None) -> RunDocument:
-    """The document of a run; twin: the same run without control, None if nothing acts."""
+def run_document(found: Simulation) -> RunDocument:
+    """The document of a run."""
+    run, twin = found.run, found.free
     metrics, loop = _short(result_variables(run)), loop_variables(run)
     labelled_numbers, windows = metrics | loop, run.case.windows
     return RunDocument(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import jax
 import numpy as np
@@ -21,12 +22,15 @@ from studies.engine.programs import kept_jit
 from studies.engine.runs import resolved_study
 from studies.errors import field_error
 from studies.publish import replacing
-from studies.results.labelled import plain
+from studies.result import Result
+from studies.results.labelled import Variable, Variables, plain
+from studies.show.report import Report
 from studies.study.spec import Study
 from studies.study.state_space import FORMATS
 
 
-class NamedSystem(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class NamedSystem(Result):
     """A linear discrete-time system between commands and sensors, with names of its ports.
 
     "actuator LINK.PATCH" is a command [V], "sensor LINK.PATCH" a voltage behind the anti-alias
@@ -40,6 +44,26 @@ class NamedSystem(NamedTuple):
     sample_time: float  # [s]
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+
+    def variables(self) -> dict[str, Variable]:
+        found = Variables()
+        for name, row, column in (
+            ("a", "state", "from_state"),
+            ("b", "state", "input"),
+            ("c", "output", "from_state"),
+            ("d", "output", "input"),
+        ):
+            found.put(name, getattr(self, name), "SI", f"matrix {name.upper()}", row, column)
+        found.put("input", list(self.inputs), "1", "port", "input")
+        found.put("output", list(self.outputs), "1", "port", "output")
+        return found
+
+    def report(self) -> Report:
+        inputs, outputs = (f"{len(x)} {x[0].split()[0]}s" for x in (self.inputs, self.outputs))
+        text = (
+            f"{len(self.a)} states, {inputs} to {outputs}, {1e6 * self.sample_time:g} µs a sample"
+        )
+        return Report("Linear system", [text], "", "", [], [], {})
 
 
 @kept_jit(static_argnums=0)

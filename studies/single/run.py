@@ -2,32 +2,53 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
-from studies.engine.design import deviations, load_design
+from studies.engine.design import as_design, deviations
 from studies.engine.run_data import run_attributes, run_variables
 from studies.engine.runs import Run, run_study, uncontrolled_twin
 from studies.errors import StudyError
 from studies.publish import REPORT, check_target, publish
+from studies.result import Result, in_folder
+from studies.results.labelled import Variable
 from studies.show.units import count_text
 from studies.store import write_store
 from studies.study.labels import describe
-from studies.study.spec import Study, load_study
+from studies.study.spec import Study
 
 #: Drawn next to the file of a run.
 FIGURES = ("deflection", "error", "voltage", "machine")
 
 
-class Replay(NamedTuple):
-    """A rerun case of a sweep, compared with all that the sweep has kept of it."""
+@dataclass(frozen=True, eq=False)
+class Simulation(Result):
+    """A run, and what a sweep has kept of it, if it is a case of one."""
 
     run: Run
-    stored_status: int | None  # of the sweep; None if there is none
-    differences: dict[str, tuple[float, float]]  # from `deviations`
+    stored_status: int | None = None  # of the sweep; None if there is none
+    differences: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # `deviations`
+    name: str = "STUDY"  # of the study on the command line
+
+    @cached_property
+    def free(self) -> Run | None:
+        """The same run without control; None if nothing acts."""
+        return uncontrolled_twin(self.run)
+
+    @property
+    def is_good(self) -> bool:
+        return self.agrees and (self.stored_status is not None or not self.run.status)
+
+    def variables(self) -> dict[str, Variable]:
+        return run_variables(self.run)
+
+    def told(self) -> list[str]:
+        page = self.folder and self.folder.with_suffix(".html")
+        return [*super().told(), *([f"report: {page}"] if page and page.is_file() else [])]
 
     @property
     def agrees(self) -> bool:
@@ -66,72 +87,35 @@ class Replay(NamedTuple):
         ]
 
 
-def simulate(
-    study: Study | str | Path,
+def simulated(
+    what: Study | str | Path,
     out: str | Path | None = None,
+    case: int | str | None = None,
     has_report: bool = False,
     has_margins: bool = False,
-) -> Run:
-    """Run a study with full trajectories, and write the requested files.
-
-    Args:
-        study: what to run; or its file, or the name of a ready one.
-        out: HDF5 file for trajectories and metrics; None: nothing is written.
-        has_report: whether to also write the report next to that file.
-        has_margins: whether to also find disk, phase and delay margin.
-
-    Raises:
-        StudyError: a fault of the study, or a file that cannot be written.
-    """
+) -> Simulation:
+    """Run a study and write the requested files; arguments and errors as `studies.simulate`."""
     file = _output_file(out, has_report)
-    name = "STUDY" if isinstance(study, Study) else str(study)
-    study = study if isinstance(study, Study) else load_study(study)
-    run = run_study(study, has_margins=has_margins)
+    design = as_design(what, case)
+    name = "STUDY" if isinstance(what, Study) else str(what)
+    name = name if case is None else f"{name} --case {case}"
+    run = run_study(design.study, has_margins=has_margins)
+    again = Simulation(run, name=name)
+    if design.stored:
+        found = deviations(run, design.stored)
+        again = Simulation(run, int(design.stored["status"]), found, name)
     if file is not None:
-        write_results(file, run, has_report, name=name)
-    return run
+        write_results(file, again, has_report)
+    return in_folder(again, file)
 
 
-def replay(
-    design: str | Path,
-    case: int | str | None = None,
-    out: str | Path | None = None,
-    has_report: bool = False,
-) -> Replay:
-    """Rerun one case of a sweep with full trajectories, and compare with the sweep's results.
-
-    Args:
-        design: study file, folder of a tuning or a sweep.
-        case: as in `load_design`.
-        out, has_report: as in `simulate`.
-
-    Raises:
-        StudyError: as `load_design` and `simulate`.
-    """
-    file = _output_file(out, has_report)
-    loaded = load_design(design, case)
-    run = run_study(loaded.study)
-    if loaded.stored:
-        again = Replay(run, int(loaded.stored["status"]), deviations(run, loaded.stored))
-    else:
-        again = Replay(run, None, {})
-    if file is not None:
-        name = str(design) if case is None else f"{design} --case {case}"
-        write_results(file, run, has_report, again.notes, name)
-    return again
-
-
-def write_results(
-    out: Path, run: Run, has_report: bool, notes: Sequence[str] = (), name: str = "STUDY"
-) -> None:
+def write_results(out: Path, found: Simulation, has_report: bool) -> None:
     """Write a run to its file and, if requested, its report next to it.
 
     Args:
         out: file of the run.
-        run: with trajectories.
+        found: with trajectories.
         has_report: whether to write the report.
-        notes: sentences that the report adds.
-        name: of the study on the command line, for commands in the report.
 
     Raises:
         StudyError: a file cannot be written.
@@ -139,12 +123,12 @@ def write_results(
     with publish(out.parent) as staging:
         if has_report:
             from studies.show.pages import write_report
-            from studies.single.say import say
 
-            write_report(say(run, uncontrolled_twin(run), notes, name), staging)
+            write_report(found.report(), staging)
             for file in [*staging.iterdir()]:
                 end = ".html" if file.name == REPORT else f"-{file.name}"
                 file.rename(staging / f"{out.stem}{end}")
+        run = found.run
         write_store(staging / out.name, run_variables(run), run_attributes(run.study))
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from jaxmodel import status
@@ -17,6 +15,7 @@ from studies.show.report import Chapter, Report, chapter, drawing, machine
 from studies.show.units import headed, number
 from studies.show.words import control_text, motion_text
 from studies.single import plots
+from studies.single.run import Simulation
 from studies.study import margin
 from studies.study.labels import describe, remedy
 from studies.study.spec import AUTO
@@ -37,17 +36,9 @@ LATER = 0.02
 STICKING = 2e-6
 
 
-def say(
-    run: Run, twin: Run | None = None, notes: Sequence[str] = (), name: str = "STUDY"
-) -> Report:
-    """What a run tells.
-
-    Args:
-        run: figures need its trajectories.
-        twin: the same run without control; None: nothing to compare with.
-        notes: sentences to add.
-        name: of the study on the command line.
-    """
+def say(found: Simulation) -> Report:
+    """What a run tells; figures need its trajectories."""
+    run, twin = found.run, found.free
     study, loop, case = run.study, run.loop, _situation(run, twin)
     advice = remedy(run.status)
     warnings = margin.caution(loop.gain_margin) if loop is not None else "", _limits(run)
@@ -57,14 +48,14 @@ def say(
         *_outcome(run, twin, case),
         *(f"**{text}**" for text in warnings if text),
         margin.hysteresis_text(study.patches.hysteresis),
-        *notes,
+        *found.notes,
         *machine_notes(run),
     ]
     return Report(
         title=f"{study.title or 'untitled study'}: one run",
         result=result,
         question=f"{motion_text(study)}; {control_text(study)}: how much vibration is left?",
-        next_steps=_next_steps(run, case, name),
+        next_steps=_next_steps(run, case, found.name),
         top=[run.result.record and machine(study)],
         chapters=[_links(run, twin), _platform(run), _loop(run)],
         files={"Study file": study},
@@ -169,7 +160,7 @@ def machine_notes(run: Run) -> list[str]:
 
 
 def _next_steps(run: Run, case: str, name: str) -> str:
-    well = f"""`studies spillover {name} --out certificate` to see how far to trust the design,
+    well = f"""`studies certify {name} --out certificate` to see how far to trust the design,
     `studies tune SPEC` for a better one, `studies export {name} --target c --out dsp` for the
     controller."""
     drives = """, or leave `metrics.residual_delay` out: before the slider drive has settled it
@@ -179,7 +170,7 @@ def _next_steps(run: Run, case: str, name: str) -> str:
         "limits": f"{remedy(run.status) or 'lower the gains or slow the motion'}.",
         "margin": f"""lower `control.gain_factor`, or move the patches: a section `[sweep]` in this
         study's file, with the axes `gain` and `placement`, shows where margins are larger (`studies
-        init --from placement` is an example, for the paper's machine). `studies spillover {name}
+        init --from placement` is an example, for the paper's machine). `studies certify {name}
         --out certificate` names what goes unstable first.""",
         "uncontrolled": "control the links (`[control]`) and compare.",
         "calm": f"""less than {number(run.study.metrics.settling_band, "m")} µm is left without

@@ -1,7 +1,7 @@
 """How axes combine: from the tree of blocks to columns of values, one row per case.
 
 A design has any number of cases, since only those are made that are asked for: all of a sweep, some
-at a time of a screen.
+at a time of one that keeps the best.
 """
 
 from __future__ import annotations

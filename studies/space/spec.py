@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, ValidationError
 
-from jaxmodel.loop_figures import MARGINS, PEAKS
+from jaxmodel.loop_figures import HIGHEST, MARGINS, PEAKS
 from studies.errors import StudyError, field_error, nearest
 from studies.reading import check_depth
 from studies.space.methods import METHODS
@@ -24,6 +24,7 @@ from studies.study.choices import OWN, OneOf
 from studies.study.entries import entry_sizes, parse_entries
 from studies.study.explain import explain
 from studies.study.files import read_toml
+from studies.study.margin import ENOUGH
 from studies.study.spec import Section, Study, described, parse_study
 from studies.study.window import with_window
 
@@ -44,24 +45,8 @@ class Block(Section):
     levels: int = described(4, "1", "levels of a Morris grid", ge=2, le=100)
 
 
-class Screen(Section):
-    """All cases by the linear model, and only the best of them by the whole one."""
-
-    by: str = described("residual_rms", "-", "metric, or entry of one, that the screen ranks by")
-    keep: float = described(0.05, "1", "share of the cases that are run", gt=0, le=1)
-    subject_to: str = described(
-        "", "-", "cases are run, in the screen's order, until that share meets this condition"
-    )
-
-    @property
-    def entry(self) -> str:
-        """What the screen ranks by, without the direction."""
-        return self.by.removeprefix("-")
-
-    @property
-    def metric(self) -> str:
-        """The metric of that entry."""
-        return self.entry.partition("[")[0]
+#: Best designs of a sweep that keeps some, whatever their margins: they are chosen among these.
+CANDIDATES = 100_000
 
 
 class Sweep(Block):
@@ -75,6 +60,19 @@ class Sweep(Block):
         (), "-", f"further figures of every sampled loop to keep: {', '.join((*MARGINS, *PEAKS))}"
     )
     by: str = described("residual_rms", "-", "metric, or entry of one, that cases are ranked by")
+    keep: int = described(
+        0,
+        "1",
+        "keep only so many designs, the best, which run in full; 0: all",
+        ge=0,
+        le=CANDIDATES,
+    )
+    margin: float = described(
+        ENOUGH, "1", "with keep: least gain margin of kept designs; 0: any", ge=0, lt=HIGHEST
+    )
+    subject_to: str = described(
+        "", "-", "condition on metrics and axes that the best must meet, with keep so many designs"
+    )
     links: tuple[int, ...] = described(
         (), "1", "links that metrics are taken over, from 1; empty: those that any case controls"
     )
@@ -88,9 +86,11 @@ class Sweep(Block):
         "worst", "-", "how: by the worst case, the mean, or a quantile (1 is the worst)"
     )
     fidelity: Literal["full", "linear"] = described(
-        "full", "-", "model of the runs; linear: mechanics linearised at the last way-point"
+        "full",
+        "-",
+        "model of the runs, with keep of those that find the best; linear: mechanics linearised at "
+        "the last way-point",
     )
-    screen: dict[str, Any] = described({}, "-", "run only the best cases of the linear model")
 
 
 class BlockNode(NamedTuple):
@@ -103,9 +103,10 @@ class BlockNode(NamedTuple):
 
 #: What says which cases there are.
 SPREADING = {*Block.model_fields, "where", "seed"}
-#: What says how finished cases are counted and ranked, of a sweep and of its screen.
-READING = {"repeats", "by", "links", "environments", "over"}
-SELECTING = {"keep", "subject_to"}
+#: What says which designs are kept.
+SELECTING = {"keep", "margin", "subject_to"}
+#: What says how finished cases are counted and ranked.
+READING = {"repeats", "by", "links", "environments", "over", *SELECTING}
 
 
 class SweepSpec(NamedTuple):
@@ -114,7 +115,6 @@ class SweepSpec(NamedTuple):
     study: Study  # values of all fields that do not vary
     sweep: Sweep
     root: BlockNode  # the tree of blocks; its block is `sweep`
-    screen: Screen | None  # None: every case runs
     data: dict[str, Any]  # as read, for the record
 
 
@@ -144,8 +144,10 @@ def parse_sweep(data: dict[str, Any]) -> SweepSpec:
     )
     sweep = _parse_block(Sweep, data["sweep"], "sweep")
     assert isinstance(sweep, Sweep)
-    ranking = parse_entries(sweep.by, "sweep.by", _known_sizes(study)).metric
-    if "by" in data["sweep"] and sweep.metrics and ranking not in sweep.metrics:
+    entry = sweep.by.removeprefix("-") if sweep.keep else sweep.by  # - for the largest first
+    ranking = parse_entries(entry, "sweep.by", _known_sizes(study)).metric
+    is_ranked = sweep.keep or "by" in data["sweep"]
+    if is_ranked and sweep.metrics and ranking not in sweep.metrics:
         raise field_error("sweep.by", sweep.by, f"one of sweep.metrics = {list(sweep.metrics)}")
     known = range(1, study.n_links + 1)
     if not set(sweep.links) <= set(known) or len(set(sweep.links)) < len(sweep.links):
@@ -158,8 +160,8 @@ def parse_sweep(data: dict[str, Any]) -> SweepSpec:
             raise field_error("sweep.robustness", name, ", ".join((*MARGINS, *PEAKS)), hint=hint)
         if sweep.robustness.count(name) > 1:
             raise field_error("sweep.robustness", name, "each figure once")
-    screen = _parse_screen(sweep, study) if "screen" in data["sweep"] else None
-    return SweepSpec(study=study, sweep=sweep, root=_node(sweep, "sweep"), screen=screen, data=data)
+    _check_kept(sweep, data["sweep"])
+    return SweepSpec(study=study, sweep=sweep, root=_node(sweep, "sweep"), data=data)
 
 
 def _known_sizes(study: Study) -> dict[str, int]:
@@ -168,22 +170,20 @@ def _known_sizes(study: Study) -> dict[str, int]:
     return {axis: sizes[axis] for axis in ("link", "pose_axis")}
 
 
-def _parse_screen(sweep: Sweep, study: Study) -> Screen:
-    try:
-        screen = Screen.model_validate(sweep.screen)
-    except ValidationError as error:
-        raise explain(error, Screen, sweep.screen, inside="sweep.screen") from None
-    ranking = parse_entries(screen.entry, "sweep.screen.by", _known_sizes(study)).metric
-    if sweep.metrics and ranking not in sweep.metrics:
-        allowed = f"one of sweep.metrics = {list(sweep.metrics)}"
-        raise field_error("sweep.screen.by", screen.by, allowed)
-    if sweep.fidelity == "linear":
-        raise field_error("sweep.screen", "a table", "no screen with sweep.fidelity = 'linear'")
+def _check_kept(sweep: Sweep, written: dict[str, Any]) -> None:
+    """Check that a sweep that keeps its best designs has what it needs, and no other has it."""
+    if not sweep.keep:
+        if "margin" in written:
+            raise field_error("sweep.margin", sweep.margin, "none without sweep.keep")
+        return
     if METHODS[sweep.method].analysis is not None:
         raise field_error(
-            "sweep.screen", "a table", f"none with method {sweep.method}, which needs every case"
+            "sweep.keep", sweep.keep, f"0 with method {sweep.method}, which needs every case"
         )
-    return screen
+    for name in ("repeats", "environments"):
+        value, default = getattr(sweep, name), Sweep.model_fields[name].default
+        if value != default:
+            raise field_error(f"sweep.{name}", value, f"{default!r} with sweep.keep")
 
 
 def _parse_block(model: type[Block], data: Any, path: str) -> Block:

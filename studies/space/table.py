@@ -157,7 +157,7 @@ def build_table(spec: SweepSpec, rows: np.ndarray | None = None, has_ids: bool =
     if rows is None:
         if design.size > LIMIT:
             raise StudyError(
-                f"sweep: {design.size:.3g} cases; allowed: up to {LIMIT}. studies screen finds the "
+                f"sweep: {design.size:.3g} cases; allowed: up to {LIMIT}; sweep.keep finds the "
                 "best of more"
             )
         rows = np.arange(design.size)

@@ -3,7 +3,7 @@
 - `plants` defines the plants and their linearised loops, `certificate` judges them:
   `certify(study)`; `proofs` is about what lies between and beyond them.
 - `fast_move` runs the nominal machine with and without the controller.
-- `report`, `plots` and `run` write everything into a folder, `commands` is `studies spillover`.
+- `report`, `plots` and `run` write everything into a folder, `verb` is `studies.certify`.
 """
 
 import lazy_loader

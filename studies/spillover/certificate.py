@@ -13,7 +13,7 @@ from studies.engine.controller import FixedController, fixed_controller
 from studies.engine.host_loop import SampledLoop, name_motion
 from studies.engine.stability import LoopFigures, judge_loop, worst_figures
 from studies.errors import StudyError, field_error
-from studies.publish import shown
+from studies.result import Result
 from studies.results.breaking import BreakingChange
 from studies.results.labelled import Labelled, Records, derived, labelled, told, unwritten
 from studies.spillover.fast_move import ControlEffect
@@ -54,14 +54,15 @@ _PLANTS = ("basis", "mismatch", "plant_modes")
 _MODES = (*_PLANTS, "link_mode", "pole")
 
 
-class Certificate(Labelled, command="spillover", version=4):
-    """`certificate.json`, written by `studies spillover`: the verdict on a controller, and every
+class Certificate(Labelled, Result, command="certify", version=4):
+    """`certificate.json`, written by `studies certify`: the verdict on a controller, and every
     plant that it was judged on.
 
     Axes: B bases, D mismatches, N numbers of modes. Numbers of plants that do not exist (patches
     overlap, ...) and of modes beyond a plant's own are NaN, null in JSON; their texts "".
     """
 
+    FILES = ", data and figures in the same folder"
     ROWS = Records("plants", _PLANTS, "every plant that it was judged on", "exists")
 
     study: Study = told("complete, as a study file holds it")
@@ -95,8 +96,9 @@ class Certificate(Labelled, command="spillover", version=4):
     )
     fast_move: ControlEffect | None = told("of the nominal machine; null: none", default=None)
 
-    def _repr_html_(self) -> str:
-        return shown(self)
+    @property
+    def is_good(self) -> bool:
+        return self.is_passed
 
     @property
     def least_damping(self) -> np.ndarray:

@@ -6,8 +6,7 @@ import jax
 import numpy as np
 
 from jaxmodel.case import Case, Structure, uncontrolled
-from jaxmodel.simulate import Result as RunResult
-from jaxmodel.simulate import simulate
+from jaxmodel.simulate import RunResult, simulate
 from studies.engine.fast_motion import make_fast
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit

@@ -17,7 +17,7 @@ from studies.spillover.certificate import Certificate
 from studies.spillover.fast_move import ControlEffect
 from studies.spillover.plants import PlantVariant
 from studies.study.labels import describe
-from studies.study.margin import margin_in_db, margin_text
+from studies.study.margin import GUESSED, margin_in_db, margin_text
 from studies.study.window import residual_delay
 
 #: Spillover below this is rounding [1].
@@ -91,6 +91,7 @@ def say(certificate: Certificate) -> Report:
         f"**{spillover}**" if spillover else "",
         *statements,
         "" if changed is None else changed.text,
+        *certificate.notes,
         f"**{residual}**" if residual.startswith("CONTROL") else residual,
     ]
     return Report(
@@ -111,6 +112,7 @@ def say(certificate: Certificate) -> Report:
             _coverage(certificate),
         ],
         files={"Study file": study},
+        caveat=GUESSED,
     )
 
 
@@ -264,7 +266,6 @@ def _coverage(certificate: Certificate) -> Chapter | None:
         study's; patches in other positions, or links that differ in their mismatch; poses other
         than the first way-point, and the forces of the motion; rounding, saturation and the limits
         of the converters. The smallest change is the nearest one that a search found.""",
-        Items(certificate.notes),
     )
 
 

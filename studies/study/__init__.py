@@ -11,3 +11,7 @@ In: a TOML file or a dictionary. Out: a checked `Study`, and a `Case` of arrays 
 
 To add a field, add a line in `spec`, and its array in `cases`.
 """
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

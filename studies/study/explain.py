@@ -25,6 +25,8 @@ _PLURALS = {
 
 #: Sections beyond those of a study; commands of the same name read them.
 COMMANDS = ("sweep", "tune", "fit")
+#: Fields that take over what others had.
+SUCCESSORS = {"sweep.screen": "sweep.keep"}
 
 
 def unit_of(info: FieldInfo) -> str:
@@ -184,6 +186,7 @@ def _unknown(
     field = prefix + name
     own = nearest(name, model.model_fields)
     close = prefix + own if own else nearest_field(field, _fields(study, inside))
+    close = SUCCESSORS.get(field, close)
     hint = f"did you mean {close!r}?" if close else ""
     where = f"in [{prefix.rstrip('.')}]" if prefix else "at the top"
     if not prefix and name in COMMANDS:

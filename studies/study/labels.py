@@ -48,8 +48,6 @@ RESERVED = (
     "pose_axis",
     "record",
     "repeat",
-    "screen_status",
-    "screen_value",
     "seed",
     "sensitivity_peak",
     "sensor_condition",

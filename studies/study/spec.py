@@ -514,6 +514,11 @@ class Study(Section):
     initial: InitialSection = InitialSection()
     metrics: MetricsSection = MetricsSection()
 
+    @staticmethod
+    def parse(data: dict[str, Any]) -> Study:
+        """A study from its sections, as `parse_study`."""
+        return parse_study(data)
+
     def change(self, **fields: Any) -> Study:
         """Copy with other values; dots are double underscores: `change(control__gain_factor=1.0)`.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from studies.engine.breaking import parse_tolerances, smallest_change
@@ -13,17 +13,17 @@ from studies.results.breaking import BrokenCase
 
 
 def breaking_changes(
-    folder: Path, cases: Iterable[int], tolerances: Iterable[str]
+    folder: Path, cases: Iterable[int], tolerances: Mapping[str, float | str]
 ) -> Iterator[BrokenCase]:
     """The smallest change that breaks each of some cases; what cannot be judged says why.
 
     Args:
         folder: of the sweep.
         cases: their numbers.
-        tolerances: texts NAME=VALUE, see `parse_tolerances`.
+        tolerances: see `parse_tolerances`.
 
     Raises:
-        StudyError: a text that is none.
+        StudyError: one that is none.
     """
     units = parse_tolerances(tolerances)
     for case in cases:

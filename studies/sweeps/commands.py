@@ -1,36 +1,18 @@
-"""The commands of sweeps: sweep, show, plot, best, sensitivity."""
+"""The commands that read sweeps: show, plot, best, sensitivity."""
 
 from __future__ import annotations
 
 import re
 import sys
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
-from studies.cluster.connect import (
-    TIMEOUT,
-    LocalWorkers,
-    Scheduler,
-    Workers,
-    WorkerTimeout,
-)
+from studies.commands import settings
 from studies.config import start
 from studies.errors import StudyError
-from studies.options import (
-    Explore,
-    HasReport,
-    MaybeOut,
-    Precision,
-    Quiet,
-    Resume,
-    SweepFile,
-    Tolerance,
-)
-from studies.publish import EXPLORER, REPORT, announce
 from studies.results.document import AsJson, print_document
 
 if TYPE_CHECKING:
@@ -52,103 +34,7 @@ def _read(folder: Path) -> SweepData:
 
 
 def add_commands(app: typer.Typer, console: Console) -> None:
-    """Add the commands of sweeps to the command line."""
-
-    @app.command()
-    def sweep(
-        spec: SweepFile,
-        out: MaybeOut = None,
-        resume: Resume = False,
-        dry_run: Annotated[
-            bool, typer.Option("--dry-run", help="show what would run, and how long it would take")
-        ] = False,
-        quiet: Quiet = False,
-        report: HasReport = False,
-        explore: Explore = False,
-        precision: Precision = "float64",
-        scheduler: Scheduler = None,
-        local_workers: LocalWorkers = None,
-        worker_timeout: WorkerTimeout = TIMEOUT,
-        as_json: AsJson = False,
-    ) -> None:
-        """Run thousands of cases from one file; finished cases survive any interruption."""
-        from studies.engine.folder import SWEEPS, refuse_existing
-
-        workers = Workers(scheduler, local_workers, worker_timeout)
-        if as_json and not dry_run:
-            raise StudyError("--json: for --dry-run only; the results: studies show DIR --json")
-        if out is not None and not dry_run:
-            refuse_existing(out, SWEEPS, resume)
-        start(precision, gpu=not workers.are_named)
-        from studies.engine.progress import Phases, duration_text
-        from studies.space.spec import load_sweep
-        from studies.sweeps.dry_run import plan_document, print_plan
-        from studies.sweeps.run import make_plan, run_sweep, sweep_phases
-
-        sweep_spec = load_sweep(spec)
-        if dry_run and workers.are_named:
-            raise StudyError("--dry-run: plans for this process only; leave the workers out")
-        for name, is_wanted in (("--report", report), ("--explore", explore)):
-            if dry_run and is_wanted:
-                raise StudyError(f"{name}: --dry-run produces no results; leave one of them out")
-        if dry_run:
-            plan = make_plan(sweep_spec, out if resume else None)
-            if as_json:
-                print_document(plan_document(plan))
-            else:
-                print_plan(plan, console)
-            return
-        if out is None:
-            raise StudyError("--out: name a folder for the results")
-
-        names = (*sweep_phases(sweep_spec), *(["report"] if report else []))
-        with Phases(console, names, quiet) as phases:
-            done = run_sweep(sweep_spec, out, resume, workers=workers, phases=phases)
-            if report and not done.is_interrupted:
-                from studies.sweeps.say import write_sweep_report
-
-                phases.begin("report")
-                write_sweep_report(out)
-        if len(done.lost):
-            print(
-                f"studies: {len(done.lost)} of {len(done.table)} cases were left out, see above; "
-                f"retry them with --resume --out {quote(str(out))}",
-                file=sys.stderr,
-            )
-        if done.is_interrupted:
-            from studies.extensions import options
-
-            print(
-                f"studies: interrupted; {done.n_done} of {len(done.table)} cases are safe; "
-                f"continue with: studies {options()}sweep {quote(str(spec))} --out "
-                f"{quote(str(out))} --resume{workers.options}",
-                file=sys.stderr,
-            )
-            sys.exit(130)
-        if not quiet:
-            console.print(
-                f"{done.n_run} cases in {done.run_time:.1f} s and {done.compile_time:.1f} s of "
-                f"compiling, {duration_text(phases.elapsed)} with all else; results: "
-                f"{out / 'results.h5'}",
-                soft_wrap=True,
-            )
-        if sweep_spec.screen is not None and not quiet:
-            from studies.engine.results import read_sweep
-            from studies.sweeps.screening import check_screen
-
-            checked = check_screen(read_sweep(out, done.table))
-            console.print("" if checked is None else checked.text, soft_wrap=True)
-        if report and not quiet:
-            announce(console, out / REPORT)
-        if done.n_run and not explore:  # a page of fewer cases
-            (out / EXPLORER).unlink(missing_ok=True)
-        if explore:
-            from studies.explorer.page import write_explorer
-            from studies.sweeps.explore import explore_sweep
-
-            write_explorer(out, explore_sweep, console, quiet)
-        if len(done.lost):
-            sys.exit(1)
+    """Add the commands to the command line."""
 
     @app.command()
     def show(
@@ -177,7 +63,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             bool,
             typer.Option("--breaks", help="also name the smallest change that breaks each of them"),
         ] = False,
-        tolerance: Tolerance = None,
+        tolerance: Annotated[
+            list[str] | None,
+            typer.Option(help="NAME=VALUE, of --breaks, as in `studies certify`"),
+        ] = None,
         as_json: AsJson = False,
     ) -> None:
         """List the best cases of a sweep by a metric."""
@@ -199,7 +88,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if breaks:
             from studies.sweeps.breaking import breaking_changes
 
-            changes = breaking_changes(folder, cases.tolist(), tolerance or [])
+            changes = breaking_changes(folder, cases.tolist(), settings("--tolerance", tolerance))
         if as_json:
             from studies.sweeps.documents import best_document
 

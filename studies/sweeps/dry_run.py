@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from studies.config import usable_cores
 from studies.engine.chunks import run_quietly
 from studies.engine.plan import Group, local_layout
 from studies.engine.preflight import check_run
-from studies.engine.progress import duration_text
 from studies.engine.stored import chunk_arrays
 from studies.errors import StudyError
+from studies.phases import duration_text
+from studies.result import Result
 from studies.results.labelled import Labelled, labelled, told
-from studies.show.listing import Rows, print_rows
+from studies.show.listing import Rows
+from studies.show.report import Report
 from studies.show.units import count_text
 from studies.space.table import CaseTable, case_study
 from studies.study.fields import idle_axes
@@ -54,7 +57,7 @@ class PlannedProgram(Labelled):
     law: str = told("of control")
     basis: str = told("of the links' modes")
     feedback: str = told("sampled, ideal or none")
-    is_linear: bool = told("of a screen")
+    is_linear: bool = told("whether it is of the linear model")
     n_modes: int = told("per link")
     n_samples: int = told("of a run")
     substeps: int = told("plant steps per sample")
@@ -69,11 +72,11 @@ class PlanDocument(Labelled, command="sweep"):
     """What `studies sweep --dry-run --json` prints: the plan of a sweep."""
 
     title: str = told("of the study")
-    n_cases: int = told("cases")
-    n_left_out: int = told("by where")
-    n_duplicates: int = told("left out")
+    n_cases: int = told("cases, or designs of which some are kept")
+    n_left_out: int = told("by where; of designs of which some are kept, of a few of them")
+    n_duplicates: int = told("left out, of the same")
     n_computed: int = told("cases that --resume finds in the folder")
-    axes: list[SweptAxis] = told("what varies")
+    axes: list[SweptAxis] = told("what varies, of the same")
     programs: list[PlannedProgram] = told("what would be compiled and run")
     sample: dict[str, Any] = told("the case in the middle: number, id, what varies")
     sample_fault: str = told("why the sample cannot run, empty if it can")
@@ -84,7 +87,7 @@ def estimate(plan: Plan) -> Estimate:
     """What the cases left take in this process, measured on some of each program."""
     seconds, compiling, size, measured = 0.0, 0.0, 0.0, 0
     for group in plan.groups:
-        count = min(MEASURED, len(group.rows))
+        count, n_cases = min(MEASURED, len(group.rows)), plan.n_cases(group)
         chosen = np.linspace(0, len(group.rows) - 1, count).astype(int)
         some = group._replace(
             rows=group.rows[chosen],
@@ -96,10 +99,10 @@ def estimate(plan: Plan) -> Estimate:
             began = time.perf_counter()
             chunks = list(run_quietly(plan.table, [some]))
             spent.append(time.perf_counter() - began)
-        share = len(group.rows) / count
+        share = n_cases / count
         seconds += share * spent[1]
         compiling += max(spent[0] - spent[1], 0.0)
-        for done in chunks:
+        for done in chunks if group.is_judged else ():  # those of others are not stored
             arrays = chunk_arrays(plan.table, done, list(done.judged.result.metrics))
             size += share * sum(x.nbytes for x in arrays.values())
         measured += count
@@ -108,69 +111,107 @@ def estimate(plan: Plan) -> Estimate:
 
 def estimate_text(plan: Plan, found: Estimate) -> str:
     """The same as a sentence."""
-    left = sum(len(group.rows) for group in plan.groups)
+    left = sum(map(plan.n_cases, plan.groups))
     return (
         f"time: about {duration_text(found.seconds)} for {count_text(left, 'case')} in this "
         f"process on {count_text(usable_cores(), 'core')}, by {found.measured_cases} that "
         f"were run, and what compiling takes, {duration_text(found.compile_seconds)} just now; "
-        f"N machines like this one (--scheduler) take 1/N. Storage: "
+        f"N machines like this one (--workers) take 1/N. Storage: "
         f"about {found.bytes / 2**20:.2g} MiB"
     )
 
 
-def print_plan(plan: Plan, console: Console) -> None:
-    """Print what a sweep would run, a sample case, and how long it would take."""
-    table = plan.table
-    console.print(
-        f"{count_text(len(table), 'case')} ({table.n_dropped} left out by where, "
-        f"{table.n_double} duplicates, {plan.n_before} already computed)"
-    )
-    for line in idle_axes(table.study, table.columns):
-        console.print(line)
-    print_rows(axis_rows(table), console)
-    for group in plan.groups:
-        layout, structure = group.layout, group.structure
-        console.print(
-            f"program: {'linear model, ' if structure.is_linear else ''}law {structure.law}, "
-            f"drive {structure.drive}, {structure.basis}, "
-            f"{count_text(structure.n_modes, 'mode')}, {structure.feedback} feedback, "
-            f"{count_text(structure.n_steps, 'sample')} of "
-            f"{count_text(structure.substeps, 'plant step')}: "
-            f"{count_text(len(group.rows), 'case')} in {count_text(len(group.chunks()), 'chunk')} "
-            f"of {count_text(layout.devices, 'device')} x {count_text(layout.blocks, 'block')} x "
-            f"{count_text(layout.lanes, 'lane')}"
-        )
+@dataclass(frozen=True, eq=False)
+class PlannedSweep(Result):
+    """What a sweep would do, and how long that would take."""
+
+    plan: Plan
+
+    @cached_property
+    def estimate(self) -> Estimate:
+        """What the cases left take in this process, measured on some of each program."""
+        return estimate(self.plan)
+
+    def document(self) -> PlanDocument:
+        return plan_document(self.plan, self.estimate)
+
+
+def say(planned: PlannedSweep) -> Report:
+    """What a sweep would run, a sample case, and how long it would take."""
+    plan, table = planned.plan, planned.plan.table
     sample = sample_record(table)
     values = ", ".join(f"{name} = {short_value(sample[name])}" for name in table.axes)
-    console.print(f"sample: case {sample['case']}, id {sample['case_id']}: {values}")
-    if fault := sample_fault(table):
-        console.print(f"the sample cannot run: {fault}")
-    if not plan.groups:
-        console.print("nothing left to run")
-    if not plan.groups or (sample_fault(table) and len(table) == 1):
-        return
-    console.print("measuring how long that takes ...")
-    console.print(estimate_text(plan, estimate(plan)), soft_wrap=True)
+    fault = sample_fault(table)
+    is_timed = plan.groups and not (fault and len(table) == 1)
+    return Report(
+        title=f"{table.study.title}: plan",
+        result=[cases_text(plan), *idle_axes(table.study, table.columns)],
+        question="",
+        next_steps="",
+        top=[
+            axis_rows(table),
+            *(_program_text(plan, group) for group in plan.groups),
+            f"sample: case {sample['case']}, id {sample['case_id']}: {values}",
+            fault and f"the sample cannot run: {fault}",
+            "" if plan.groups else "nothing left to run",
+            estimate_text(plan, planned.estimate) if is_timed else "",
+        ],
+        chapters=[],
+        files={},
+    )
 
 
-def plan_document(plan: Plan) -> PlanDocument:
-    """What `studies sweep --dry-run` says."""
+def _program_text(plan: Plan, group: Group) -> str:
+    layout, structure = group.layout, group.structure
+    n_cases, n_chunks = plan.n_cases(group), plan.n_chunks(group)
+    return (
+        f"program: {'linear model, ' if structure.is_linear else ''}law {structure.law}, "
+        f"drive {structure.drive}, {structure.basis}, "
+        f"{count_text(structure.n_modes, 'mode')}, {structure.feedback} feedback, "
+        f"{count_text(structure.n_steps, 'sample')} of "
+        f"{count_text(structure.substeps, 'plant step')}: "
+        f"{count_text(n_cases, 'case')} in {count_text(n_chunks, 'chunk')} "
+        f"of {count_text(layout.devices, 'device')} x {count_text(layout.blocks, 'block')} x "
+        f"{count_text(layout.lanes, 'lane')}"
+    )
+
+
+def cases_text(plan: Plan) -> str:
+    """What there is to run, in a sentence."""
+    table, screen = plan.table, plan.screen
+    if screen is None:
+        return (
+            f"{count_text(len(table), 'case')} ({table.n_dropped} left out by where, "
+            f"{table.n_double} duplicates, {plan.n_before} already computed)"
+        )
+    sweep = screen.spec.sweep
+    margin = f" with a gain margin of at least {sweep.margin:g}" if sweep.margin else ""
+    shards = count_text(screen.n_shards, "shard")
+    return (
+        f"{screen.n_designs:,} designs in {shards} ({plan.n_before:,} already computed) by the "
+        f"{sweep.fidelity} model; of them the best {sweep.keep:,}{margin} by the full one. Axes "
+        f"and programs are told from {len(table):,} designs"
+    )
+
+
+def plan_document(plan: Plan, found: Estimate) -> PlanDocument:
+    """What `studies sweep --dry-run` says; found: what it would take."""
     table = plan.table
     return PlanDocument(
         title=table.study.title,
-        n_cases=len(table),
+        n_cases=len(table) if plan.screen is None else plan.screen.n_designs,
         n_left_out=table.n_dropped,
         n_duplicates=table.n_double,
         n_computed=plan.n_before,
         axes=axes_of(table),
-        programs=[_program(group) for group in plan.groups],
+        programs=[_program(plan, group) for group in plan.groups],
         sample=sample_record(table),
         sample_fault=sample_fault(table),
-        estimate=estimate(plan),
+        estimate=found,
     )
 
 
-def _program(group: Group) -> PlannedProgram:
+def _program(plan: Plan, group: Group) -> PlannedProgram:
     structure = group.structure
     return PlannedProgram(
         law=structure.law,
@@ -180,8 +221,8 @@ def _program(group: Group) -> PlannedProgram:
         n_modes=structure.n_modes,
         n_samples=structure.n_steps,
         substeps=structure.substeps,
-        n_cases=len(group.rows),
-        n_chunks=len(group.chunks()),
+        n_cases=plan.n_cases(group),
+        n_chunks=plan.n_chunks(group),
         **group.layout._asdict(),
     )
 

@@ -81,7 +81,7 @@ def explore_sweep(
         baseline=_baseline(data, [x.name for x in figures]),
         conditions=_conditions(data, rank),
         command=(
-            f"studies {options()}replay {quote(str(folder))} --case ",
+            f"studies {options()}simulate {quote(str(folder))} --case ",
             " --report --out case-",
             ".h5",
         ),

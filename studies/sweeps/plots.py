@@ -17,7 +17,6 @@ from matplotlib.figure import Figure
 
 from jaxmodel import status
 from jaxmodel.loop_figures import HIGHEST
-from studies.engine.columns import LEFT_OUT
 from studies.engine.front import pareto_front
 from studies.engine.results import SweepData, as_sweep, metric_values, swept_names
 from studies.errors import StudyError
@@ -79,7 +78,7 @@ def plot(sweep: SweepData | str | Path, x: str | None, y: str, hue: str | None =
             chosen = chosen & np.isfinite(there)
         if not chosen.any():
             raise StudyError(f"{option} {name}: no case of status ok has it")
-    is_run = chosen | (data["status"] >= 0) & (data["status"] != LEFT_OUT)
+    is_run = chosen | (data["status"] >= 0)
     whole, color = _drawn(data, x), None if hue is None else _drawn(data, hue)
     across, group = whole[chosen], None if color is None else color[chosen]
     shown = shown_metric(data, y)[chosen]
@@ -212,13 +211,10 @@ def _scale_ordinate(ax: Axes, value: np.ndarray) -> None:
 
 
 def _note_left_out(figure: Figure, data: SweepData, chosen: np.ndarray, more: str = "") -> None:
-    n_screened, parts = int(np.sum(data["status"] == LEFT_OUT)), []
-    is_left = ~chosen & (data["status"] != LEFT_OUT)
-    if n_screened:
-        parts.append(f"the screen left out {n_screened:,} of {len(chosen):,} cases")
-    if is_left.any():
-        why = left_out_text(data, is_left)
-        parts.append(f"{np.sum(is_left):,} of {len(chosen):,} cases are left out ({why})")
+    parts = []
+    if not chosen.all():
+        why = left_out_text(data, ~chosen)
+        parts.append(f"{np.sum(~chosen):,} of {len(chosen):,} cases are left out ({why})")
     if MARGIN in data.variables:
         n_low = int(np.sum(data[MARGIN][chosen] < ENOUGH))
         if n_low:

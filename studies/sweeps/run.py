@@ -5,83 +5,90 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich.console import Console
 
-from jaxmodel.case import Structure
-from studies import config
-from studies.cluster.connect import Place, on_workers
-from studies.cluster.runner import ClusterRunner
+from jaxmodel import status
+from studies.cluster.connect import TIMEOUT, Place, on_workers
+from studies.cluster.runner import ClusterRunner, run_chunk
 from studies.engine.baseline import keep_baseline
-from studies.engine.chunks import Done, LocalRunner, Lost, Runner
+from studies.engine.chunks import LocalRunner, Lost, Runner
 from studies.engine.folder import (
     CONTENT,
-    SCREEN,
+    MANIFEST,
     Finished,
     SweepFolder,
     check_resumed,
     finished_cases,
     make_manifest,
-    open_folder,
+    read_manifest,
 )
-from studies.engine.plan import Group, Layout, local_layout, plan_groups
-from studies.engine.progress import Phases, Reporter, interrupts
-from studies.engine.results import links_of
-from studies.engine.screen import (
-    Round,
+from studies.engine.plan import Group, local_layout, plan_groups
+from studies.engine.progress import Reporter
+from studies.engine.results import meets
+from studies.engine.stored import (
     check_names,
-    first_round,
-    full_runs,
-    next_round,
-    ranked,
-    screen_arrays,
-    screen_groups,
-    screened_cases,
+    chunk_arrays,
+    kept_metrics,
+    manifest_attributes,
+    merge,
 )
-from studies.engine.stored import chunk_arrays, kept_metrics, manifest_attributes, merge
 from studies.errors import StudyError
-from studies.publish import shown
+from studies.job import Job
+from studies.phases import Phases, interrupts
+from studies.result import in_folder
+from studies.screen.local import LocalScreener, Screener
+from studies.screen.run import PHASES as SCREEN_PHASES
+from studies.screen.run import choose, chosen, run_screen
+from studies.screen.shards import ScreenRequest, screen_of, shard_groups
+from studies.screen.stored import TALLY, best_sweep, read_tally
+from studies.screen.workers import ClusterScreener, run_shard
 from studies.space.designs import design_of
-from studies.space.spec import READING, SELECTING, SPREADING, SweepSpec, load_sweep
+from studies.space.spec import READING, SPREADING, Sweep, SweepSpec, parse_sweep
 from studies.space.table import CaseTable, build_table
 from studies.study.fields import idle_axes
+from studies.sweeps.result import SweepResult
 
 #: From so many cases on, workers of this machine are worth their start.
 LARGE = 50_000
+#: The same of designs of which some are kept.
+LARGE_SCREEN = 10**6
+#: Each round of runs goes at most this many times as far down the ranking as the one before.
+FURTHER = 4
 
 
-def sweep_phases(spec: SweepSpec) -> tuple[str, ...]:
-    """Names of the phases of `run_sweep`."""
-    return ("compile", *(() if spec.screen is None else ("screen",)), "run", "join")
-
-
-class Outcome(NamedTuple):
-    """How a sweep ended."""
-
-    out: Path  # its folder
-    table: CaseTable
-    n_done: int  # cases with results, those of earlier runs included
-    n_run: int  # in this run
-    compile_time: float  # [s]
-    run_time: float  # [s]
-    is_interrupted: bool  # by Ctrl-C
-    executor: str  # that ran the last chunks; "" if there were none
-    lost: np.ndarray  # numbers of cases that were given up, with the reason in the folder
-
-    def _repr_html_(self) -> str:
-        return shown(self)
+def sweep_phases(spec: SweepSpec, has_report: bool = False) -> tuple[str, ...]:
+    """What is done."""
+    report = ("report",) if has_report else ()
+    return (*(SCREEN_PHASES if spec.sweep.keep else ()), "compile", "run", "join", *report)
 
 
 class Plan(NamedTuple):
     """What a sweep would do."""
 
-    table: CaseTable
-    groups: list[Group]  # those of a screen first
-    n_before: int  # cases already done
+    table: CaseTable  # all cases; of a sweep that keeps some, a few of its designs
+    groups: list[Group]  # of these
+    n_before: int  # cases, or designs, already done
+    screen: ScreenRequest | None = None
+
+    def n_cases(self, group: Group) -> int:
+        """How many cases the program of a group runs."""
+        if self.screen is None:
+            return len(group.rows)
+        tried, count = len(self.table), self.screen.n_designs - self.n_before
+        if group.is_judged:
+            count = min(self.screen.spec.sweep.keep, self.screen.n_designs)
+        else:
+            tried += self.table.n_dropped
+        return round(count * len(group.rows) / tried)
+
+    def n_chunks(self, group: Group) -> int:
+        """And in how many chunks."""
+        return -(-self.n_cases(group) // group.layout.size)
 
 
 def make_plan(spec: SweepSpec, out: Path | None = None) -> Plan:
@@ -92,229 +99,184 @@ def make_plan(spec: SweepSpec, out: Path | None = None) -> Plan:
         out: folder with some of them done, if the sweep is to be resumed.
 
     Returns:
-        Plan; of a screened sweep, as if the first cases passed the screen.
+        Plan; of a sweep that keeps its best designs, one of a few of them.
 
     Raises:
         StudyError: a fault of the sweep, or a folder with a different sweep.
     """
-    config.require_configured()
+    if spec.sweep.keep:
+        return _kept_plan(screen_of(spec), out)
     table, sweep = build_table(spec), spec.sweep
     check_names(spec, table)
     rows = np.arange(len(table))
     if out is not None:
-        before, _ = _joined(out, spec, table, make_manifest(spec.data))
+        before = _joined(out, spec, table, make_manifest(spec.data))
         rows = np.flatnonzero(~np.isin(table.case_id, before.case_id))
-    n_before, groups = len(table) - len(rows), []
-    if spec.screen is not None:
-        groups = screen_groups(table, rows, local_layout, spec.screen)
-        rows = rows[: full_runs(len(table), spec.screen)]
     is_linear = sweep.fidelity == "linear"
-    groups += plan_groups(table, rows, local_layout, sweep.metrics, is_linear)
-    return Plan(table, groups, n_before)
+    groups = plan_groups(table, rows, local_layout, sweep.metrics, is_linear)
+    return Plan(table, groups, len(table) - len(rows))
 
 
-def run_sweep(
-    spec: SweepSpec | str | Path,
-    out: str | Path,
-    is_resumed: bool = False,
-    console: Console | None = None,
-    is_quiet: bool = False,
+def _kept_plan(screen: ScreenRequest, out: Path | None) -> Plan:
+    table, n_before = screen.some, 0
+    if out is not None and (out / TALLY).is_file():
+        n_before = read_tally(out, screen)[1].n_designs
+    groups = shard_groups(screen, table) if n_before < screen.n_designs else []
+    groups += plan_groups(table, np.arange(len(table)), local_layout, screen.spec.sweep.metrics)
+    return Plan(table, groups, n_before, screen)
+
+
+def swept_into(
+    spec: SweepSpec,
+    job: Job,
     workers: Place = None,
-    phases: Phases | None = None,
+    timeout: float = TIMEOUT,
     runner: Runner | None = None,
-) -> Outcome:
-    """Run a sweep into a folder.
+) -> SweepResult:
+    """Run what is left of a sweep.
 
     Args:
-        spec: the sweep, or its file.
-        out: its folder.
-        is_resumed: continue or extend the existing sweep.
-        console: where progress goes; default: standard output.
-        is_quiet: hide progress.
-        workers: a number of processes on this machine, or a scheduler's address or file, as
-            `--local-workers` and `--scheduler`; default: this process, for many cases all cores.
-        phases: of a longer command, with those of `sweep_phases`, in place of console and is_quiet.
+        spec: the sweep.
+        job: with `sweep_phases`; its folder may hold the same sweep, or one that this extends.
+        workers, timeout: as in `studies.sweep`.
         runner: of the chunks, in place of workers.
-
-    Returns:
-        Outcome; `results.h5` exists unless the run was interrupted.
 
     Raises:
         StudyError: a fault of the sweep, the folder or the disk. Finished chunks stay.
+        KeyboardInterrupt: the same.
     """
-    config.require_configured()
-    spec = spec if isinstance(spec, SweepSpec) else load_sweep(spec)
-    if phases is None:
-        console = console or Console(highlight=False, markup=False)
-        with Phases(console, sweep_phases(spec), is_quiet) as phases:
-            return run_sweep(spec, out, is_resumed, None, False, workers, phases, runner)
     n_cases = design_of(spec.root, spec.study, spec.sweep.seed).size * spec.sweep.repeats
-    remote = partial(ClusterRunner, spec)
-    with on_workers(workers, n_cases >= LARGE, phases.say, remote, runner) as found:
-        return _run_rest(spec, Path(out), is_resumed, found or LocalRunner(), phases)
+    is_large = runner is None and n_cases >= (LARGE_SCREEN if spec.sweep.keep else LARGE)
+    calls = run_chunk, run_shard
+    with on_workers(workers, timeout, job.say, *calls, is_large=is_large) as remote:
+
+        def runner_of(spec: SweepSpec) -> Runner:
+            return runner or (ClusterRunner(spec, remote) if remote else LocalRunner())
+
+        if not spec.sweep.keep:
+            return _run_rest(spec, job, runner_of(spec))
+        screener = ClusterScreener(remote) if remote else LocalScreener()
+        return _run_kept(spec, job, screener, runner_of)
 
 
-def _run_rest(
-    spec: SweepSpec, out: Path, is_resumed: bool, runner: Runner, phases: Phases
-) -> Outcome:
-    say = partial(phases.console.print, soft_wrap=True)
-    manifest = make_manifest(spec.data)
-    with open_folder(out, manifest, is_resumed) as folder, interrupts() as stop:
-        table = build_table(spec)
-        check_names(spec, table)
-        before, screened_before = _joined(out, spec, table, manifest)
-        folder.begin(manifest, (*before.damaged, *screened_before.damaged), say)
-        run = _Run(spec, table, folder, runner, phases, stop)
-        if spec.screen is None:
-            rows, screened = run.full(np.arange(len(table)), _headline), None
-        else:
-            rows, screened = run.screened(screened_before)
-        if rows is not None:
-            phases.begin("join")
-            finished = finished_cases(out)
-            keep_baseline(spec, table, out, phases.say)
-            _check_whole(table, rows, np.union1d(finished.case_id, table.case_id[run.lost]), out)
-            attributes = {"title": spec.study.title, **manifest_attributes(manifest)}
-            timings = {"compile_time": run.compile_time, "run_time": run.run_time}
-            merge(out, table, finished, attributes | timings, screened)
-            folder.publish()
-        return Outcome(
-            out=out,
-            table=table,
-            n_done=len(before.case_id) + run.n_run,
-            n_run=run.n_run,
-            compile_time=run.compile_time,
-            run_time=run.run_time,
-            is_interrupted=rows is None,
-            executor=run.executor,
-            lost=run.lost,
-        )
+def _run_kept(
+    spec: SweepSpec, job: Job, screener: Screener, runner_of: Callable[[SweepSpec], Runner]
+) -> SweepResult:
+    """Find the best designs and run them, further ones until enough meet the sweep's condition."""
+    screen, count = screen_of(spec), spec.sweep.keep
+    found, done = run_screen(screen, job, screener), None
+    while True:
+        found = choose(found, count, job)
+        kept = chosen(found).kept
+        best = best_sweep(screen, kept, _earlier(job.place, kept))
+        last = _run_rest(best, job, runner_of(best))
+        done = last if done is None else last.after(done)
+        done = in_folder(replace(done, screen=found), job.place)
+        if len(kept) < count:
+            return done
+        count = _next_count(spec.sweep, done, count)
+        if count == len(kept):
+            return done
 
 
-class _Run:
-    """The chunks of one call, and what they took."""
+def _earlier(out: Path, kept: CaseTable) -> list[Any]:
+    """Cases that the folder of a sweep has, beside those to keep, as its `sweep.cases` lists them.
 
-    def __init__(
-        self,
-        spec: SweepSpec,
-        table: CaseTable,
-        folder: SweepFolder,
-        runner: Runner,
-        phases: Phases,
-        stop: threading.Event,
-    ) -> None:
-        """
-        Args:
-            spec, phases, runner: as in `run_sweep`.
-            table: all cases.
-            folder: open.
-            stop: set to end after the chunks under way.
-        """
-        self.spec, self.table, self.folder, self.runner = spec, table, folder, runner
-        self.phases, self.stop = phases, stop
-        self.lost = np.empty(0, int)  # rows that were given up
-        self.n_run, self.compile_time, self.run_time, self.executor = 0, 0.0, 0.0, ""
-        self._layouts: dict[Structure, Layout] = {}
-
-    def full(self, rows: np.ndarray, headline: Headline) -> np.ndarray | None:
-        """Run what is left of these rows; returns them, None if interrupted."""
-        sweep, kept = self.spec.sweep, kept_metrics(self.spec)
-        left = self._left(rows, finished_cases(self.folder.path))
-        is_linear = sweep.fidelity == "linear"
-        groups = plan_groups(
-            self.table,
-            left,
-            self._layout,
-            sweep.metrics,
-            is_linear,
-            robustness=sweep.robustness,
-        )
-
-        def save(done: Done) -> np.ndarray:
-            arrays = chunk_arrays(self.table, done, kept)
-            self.folder.write_chunk({"case_id": self.table.case_id[done.chunk.rows], **arrays})
-            self.n_run += len(done.chunk.rows)
-            return arrays["status"]
-
-        n_before = len(rows) - len(left)
-        text = headline(self.table, groups, n_before)
-        return rows if self._chunks("run", groups, len(rows), n_before, text, save) else None
-
-    def screened(self, before: Finished) -> tuple[np.ndarray | None, Finished]:
-        """Screen all cases and run the best.
-
-        Args:
-            before: screened by earlier calls.
-
-        Returns:
-            (rows of the best, None if interrupted; where the screen's results are).
-        """
-        screen, table, path = self.spec.screen, self.table, self.folder.path
-        assert screen is not None
-        left = self._left(np.arange(len(table)), before)
-        groups = screen_groups(table, left, self.runner.layout, screen)
-
-        def save(done: Done) -> np.ndarray:
-            arrays = screen_arrays(self.spec, table, done)
-            self.folder.write_chunk(arrays, SCREEN)
-            return arrays["screen_status"]
-
-        n_before = len(table) - len(left)
-        text = f"screen by the linear model: {_headline(table, groups, n_before)}"
-        is_whole = self._chunks("screen", groups, len(table), n_before, text, save)
-        stored = screened_cases(path)
-        if not is_whole:
-            return None, stored
-        order = ranked(table, stored, screen)
-        this: Round | None = first_round(table, order, self.spec)
-        while this is not None:
-            rows = self.full(this.rows, _kept_headline)
-            if rows is None:
-                return None, stored
-            this = next_round(table, order, self.spec, this, path)
-        return rows, stored
-
-    def _left(self, rows: np.ndarray, finished: Finished) -> np.ndarray:
-        """Those of some rows that are neither finished nor given up."""
-        is_done = np.isin(self.table.case_id[rows], finished.case_id)
-        return rows[~is_done & ~np.isin(rows, self.lost)]
-
-    def _layout(self, n: int, structure: Structure) -> Layout:
-        """One layout for all rounds of a screen, since each compiles its own program."""
-        if structure not in self._layouts:
-            self._layouts[structure] = self.runner.layout(n, structure)
-        return self._layouts[structure]
-
-    def _chunks(
-        self,
-        name: str,
-        groups: list[Group],
-        total: int,
-        n_before: int,
-        headline: str,
-        save: Callable[[Done], np.ndarray],
-    ) -> bool:
-        """Run and save chunks in a phase; returns whether all of them were run."""
-        reporter = Reporter(self.phases, name, total, n_before, len(groups))
-        reporter.say(headline)
-        n_lost = len(self.lost)
-        with closing(self.runner.run(self.table, groups, reporter, self.stop)) as chunks:
-            for one in chunks:
-                if isinstance(one, Lost):
-                    self.lost = np.concatenate([self.lost, one.chunk.rows])
-                    self.folder.give_up(one.chunk.rows, one.reason)
-                    reporter.lost(one.chunk.rows, one.reason)
-                else:
-                    reporter.chunk(save(one))
-        n_lost = len(self.lost) - n_lost
-        self.compile_time += reporter.compile_time
-        self.run_time += reporter.run_time
-        self.executor = reporter.executor or self.executor
-        return not (self.stop.is_set() and reporter.done + n_lost < total)
+    They were kept before another number or margin was asked for.
+    """
+    if not (out / MANIFEST).is_file():
+        return []
+    spec = parse_sweep(read_manifest(out)["spec"])
+    table = build_table(spec)
+    is_done = np.isin(table.case_id, finished_cases(out).case_id)
+    rows = table.row[is_done & ~np.isin(table.case_id, kept.case_id)]
+    return [spec.sweep.cases[row] for row in rows.tolist()]
 
 
-#: First line of a run: of the table, the groups that are run, and how many cases were done before.
-Headline = Callable[[CaseTable, list[Group], int], str]
+def _next_count(sweep: Sweep, done: SweepResult, count: int) -> int:
+    """How many designs to run for enough to meet the condition, if those so far are too few.
+
+    Args:
+        sweep: what is asked for.
+        done: how the run of some designs ended.
+        count: how many, best first in its table.
+    """
+    if not sweep.subject_to:
+        return count
+    data = done.found
+    is_met = meets(data, sweep.subject_to, "sweep.subject_to") & (data["status"] == status.OK)
+    n_met = int(is_met[:count].sum())
+    if n_met >= sweep.keep:
+        return count
+    needed = int(np.ceil(1.25 * sweep.keep * count / max(n_met, 1)))
+    return min(needed, FURTHER * count)
+
+
+def _run_rest(spec: SweepSpec, job: Job, runner: Runner) -> SweepResult:
+    manifest, folder, out = make_manifest(spec.data), SweepFolder(job.place), job.place
+    check_resumed(out, manifest)
+    table = build_table(spec)
+    check_names(spec, table)
+    before = _joined(out, spec, table, manifest)
+    folder.begin(manifest, before.damaged, partial(job.phases.console.print, soft_wrap=True))
+    with interrupts() as stop:
+        reporter, lost = _run_chunks(spec, table, folder, runner, job.phases, stop)
+    run_time = reporter.run_time
+    if stop.is_set() and reporter.done + len(lost) < len(table):
+        raise KeyboardInterrupt(f"{reporter.done} of {len(table)} cases are safe")
+    job.begin("join")
+    finished = finished_cases(out)
+    keep_baseline(spec, table, out, job.say)
+    _check_whole(table, np.union1d(finished.case_id, table.case_id[lost]), out)
+    attributes = {"title": spec.study.title, **manifest_attributes(manifest)}
+    timings = {"compile_time": reporter.compile_time, "run_time": run_time}
+    merge(out, table, finished, attributes | timings)
+    folder.publish()
+    result = SweepResult(
+        n_cases=len(table),
+        n_run=reporter.n_run,
+        compile_time=reporter.compile_time,
+        run_time=run_time,
+        executor=reporter.executor,
+        lost=lost,
+    )
+    return in_folder(result, out)
+
+
+def _run_chunks(
+    spec: SweepSpec,
+    table: CaseTable,
+    folder: SweepFolder,
+    runner: Runner,
+    phases: Phases,
+    stop: threading.Event,
+) -> tuple[Reporter, np.ndarray]:
+    """Run and save what is left; returns what was reported, and rows that were given up."""
+    sweep, kept = spec.sweep, kept_metrics(spec)
+    is_done = np.isin(table.case_id, finished_cases(folder.path).case_id)
+    groups = plan_groups(
+        table,
+        np.flatnonzero(~is_done),
+        runner.layout,
+        sweep.metrics,
+        sweep.fidelity == "linear",
+        robustness=sweep.robustness,
+    )
+    n_before, lost = int(is_done.sum()), [np.empty(0, int)]
+    reporter = Reporter(phases, "run", len(table), n_before, len(groups))
+    reporter.say(_headline(table, groups, n_before))
+    with closing(runner.run(table, groups, reporter, stop)) as chunks:
+        for one in chunks:
+            rows = one.chunk.rows
+            if isinstance(one, Lost):
+                lost.append(rows)
+                folder.give_up(rows, one.reason)
+                reporter.lost(rows, one.reason)
+            else:
+                arrays = chunk_arrays(table, one, kept)
+                folder.write_chunk({"case_id": table.case_id[rows], **arrays})
+                reporter.chunk(arrays["status"])
+    return reporter, np.concatenate(lost)
 
 
 def _headline(table: CaseTable, groups: list[Group], n_before: int) -> str:
@@ -330,38 +292,28 @@ def _headline(table: CaseTable, groups: list[Group], n_before: int) -> str:
     return f"{text}; chunks: {chunks}, programs to compile: {len(groups)}"
 
 
-def _kept_headline(table: CaseTable, groups: list[Group], n_before: int) -> str:
-    count = sum(len(group.rows) for group in groups)
-    text = f"{count} of {len(table)} cases pass the screen or check it"
-    return f"{text}, {n_before} more already computed" if n_before else text
-
-
-def case_content(spec: SweepSpec, table: CaseTable) -> dict[str, Any]:
+def case_content(spec: SweepSpec) -> dict[str, Any]:
     """What of a request, beside its cases' parameters, decides what is stored for a case.
 
     Parameters are in the ids of cases. Of `[sweep]` everything decides, except what says which
     cases there are and what is looked at once they are finished.
     """
-    content = spec.sweep.model_dump(mode="json", exclude={*SPREADING, *READING, "screen"})
-    content |= {"metrics": sorted(kept_metrics(spec)), "robustness": sorted(content["robustness"])}
-    if spec.screen is None:
-        return content
-    of_screen = spec.screen.model_dump(mode="json", exclude=SELECTING)
-    of_screen["links"] = links_of(spec, table).tolist()  # its values are taken over them
-    return content | {f"screen.{name}": value for name, value in of_screen.items()}
+    content = spec.sweep.model_dump(mode="json", exclude={*SPREADING, *READING})
+    return content | {
+        "metrics": sorted(kept_metrics(spec)),
+        "robustness": sorted(content["robustness"]),
+    }
 
 
-def _joined(
-    out: Path, spec: SweepSpec, table: CaseTable, manifest: dict[str, Any]
-) -> tuple[Finished, Finished]:
-    """What a folder has already, of the whole model and of the screen; completes the manifest.
+def _joined(out: Path, spec: SweepSpec, table: CaseTable, manifest: dict[str, Any]) -> Finished:
+    """What a folder has already; completes the manifest.
 
     A resumed sweep can have more cases than the existing one, but not fewer.
 
     Raises:
         StudyError: what it has would not fit the other cases, or is not part of this sweep.
     """
-    manifest[CONTENT] = case_content(spec, table)
+    manifest[CONTENT] = case_content(spec)
     check_resumed(out, manifest)
     done = finished_cases(out)
     strange = int(np.sum(~np.isin(done.case_id, table.case_id)))
@@ -372,14 +324,14 @@ def _joined(
             "axes; more values or points; for a Latin hypercube the same size). Name a new folder "
             "for another sweep"
         )
-    return done, screened_cases(out)
+    return done
 
 
-def _check_whole(table: CaseTable, rows: np.ndarray, done: np.ndarray, out: Path) -> None:
+def _check_whole(table: CaseTable, done: np.ndarray, out: Path) -> None:
     """Check that no chunks were removed while the sweep ran."""
-    lost = int(np.sum(~np.isin(table.case_id[rows], done)))
+    lost = int(np.sum(~np.isin(table.case_id, done)))
     if lost:
         raise StudyError(
-            f"{out}: chunks with {lost} of {len(rows)} cases disappeared while the sweep ran; "
+            f"{out}: chunks with {lost} of {len(table)} cases disappeared while the sweep ran; "
             "run them again with --resume"
         )

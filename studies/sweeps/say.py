@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jaxmodel import status
 from studies.engine.fidelity import Agreement, agreement
-from studies.engine.results import SweepData, as_sweep, counted_links, metric_values, swept_names
+from studies.engine.results import SweepData, counted_links, metric_values, swept_names
 from studies.errors import shown
 from studies.publish import publish
 from studies.show.pages import write_report
@@ -27,8 +26,8 @@ from studies.sweeps.dry_run import axis_rows
 from studies.sweeps.environments import environments_text, has_environments
 from studies.sweeps.plots import front, has_axes, plot
 from studies.sweeps.records import MARGIN, is_there
-from studies.sweeps.run import Outcome
-from studies.sweeps.screening import check_screen, draw_screen
+from studies.sweeps.result import SweepResult
+from studies.sweeps.screened import with_screen
 
 #: Other metrics to check.
 OTHERS = ("settling_time", "peak_voltage")
@@ -38,33 +37,38 @@ ALIKE = 0.02
 MOST_VALUES = 12
 
 
-def write_sweep_report(folder: str | Path) -> None:
+def write_sweep_report(sweep: SweepResult) -> None:
     """Write `report.html` of a sweep, with its figures, into its folder.
 
     Args:
-        folder: of a finished sweep.
+        sweep: in its folder; as read, of one that keeps its best designs, it tells of these alone.
 
     Raises:
-        StudyError: no sweep there, or a file cannot be written.
+        StudyError: a file cannot be written.
     """
-    data, agreed = as_sweep(folder), None
+    assert sweep.folder is not None
+    stale = ("cases.png", "front.png", "values.png", "influence.png")
+    with publish(sweep.folder, stale=stale) as staging:
+        write_report(say(sweep), staging)
+
+
+def say(sweep: SweepResult) -> Report:
+    """What a sweep tells."""
+    data, agreed = sweep.found, None
     if data.spec.sweep.fidelity == "linear":
         agreed = agreement(data.spec, data.table, show.ranking(data))
-    with publish(folder, stale=("cases.png", "front.png", "screen.png")) as staging:
-        write_report(say(data, str(folder), agreed), staging)
+    report = report_of(data, str(sweep.folder), agreed)
+    return report if sweep.screen is None else with_screen(report, sweep.screen, data)
 
 
-def say(
-    sweep: Outcome | SweepData | str | Path, folder: str = "DIR", agreed: Agreement | None = None
-) -> Report:
-    """What a sweep tells.
+def report_of(data: SweepData, folder: str = "DIR", agreed: Agreement | None = None) -> Report:
+    """What the cases of a sweep tell.
 
     Args:
-        sweep: how it ended, its data or its folder.
+        data: of the sweep.
         folder: of the sweep, in commands.
         agreed: how a linear sweep ranks beside the full model, if that is known.
     """
-    data = as_sweep(sweep.out if isinstance(sweep, Outcome) else sweep)
     metric, spec = show.ranking(data), data.spec
     best = show.recommended(data, metric) if show.is_ranked(data, metric) else np.array([], int)
     shown_study = case_study(data.table, int(best[0])) if len(best) else spec.study
@@ -131,7 +135,7 @@ def _run_texts(data: SweepData, agreed: Agreement | None) -> list[str]:
     counts = {name: count for name, count, _ in show.status_rows(data).rows}
     ended = f"{counts.pop('ok', 0)} of {count_text(data.n_cases, 'case')} ended ok"
     failures = "; ".join(f"{count}: {name}" for name, count in [*counts.items()][:3])
-    texts, checked = [f"{ended} ({failures})" if failures else ended], check_screen(data)
+    texts = [f"{ended} ({failures})" if failures else ended]
     if data.spec.sweep.fidelity == "linear":
         texts.append(
             "**all runs are of the linear model** (`sweep.fidelity`); check the best cases with "
@@ -139,7 +143,7 @@ def _run_texts(data: SweepData, agreed: Agreement | None) -> list[str]:
         )
     if agreed is not None:
         texts.append(agreed.text + (", **too little to rank by**" if agreed.is_poor else ""))
-    return texts if checked is None else [*texts, checked.text]
+    return texts
 
 
 def _next_steps(data: SweepData, metric: str, best: np.ndarray, folder: str) -> str:
@@ -151,8 +155,8 @@ def _next_steps(data: SweepData, metric: str, best: np.ndarray, folder: str) -> 
     names = " or ".join(f"`--by {x}`" for x in others)
     alike = f"; check whether another metric ranks them alike ({names})" if others else ""
     case = f"{folder} --case {best[0]}"
-    return f"""`studies best {folder} --by "{metric}"{subject}` for more of them, `studies replay
-    {case} --out run.h5 --report` for the trajectories of the best, `studies spillover {case} --out
+    return f"""`studies best {folder} --by "{metric}"{subject}` for more of them, `studies simulate
+    {case} --out run.h5 --report` for the trajectories of the best, `studies certify {case} --out
     certificate` for its safety on plants that differ from the model{alike}."""
 
 
@@ -171,12 +175,9 @@ def _best_cases(data: SweepData, metric: str, best: np.ndarray) -> Chapter | Non
 
 def _drawings(data: SweepData, metric: str) -> list[Drawing]:
     """Those of the figures that these cases have."""
-    screen = data.spec.screen
     drawn = []
     if has_axes(data, metric):
         drawn.append(drawing(plot, data, None, metric, name="cases"))
-    if screen and show.is_ranked(data, screen.entry):
-        drawn.append(drawing(draw_screen, data, name="screen"))
     if _has_front(data, metric):
         drawn.append(drawing(front, data, metric))
     return drawn

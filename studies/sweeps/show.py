@@ -449,7 +449,7 @@ def recommended(data: SweepData, by: str, count: int = 10) -> np.ndarray:
 
 
 def requirement(data: SweepData, by: str, is_safe: bool = True) -> str:
-    """What a case must meet to be recommended: a gain margin of `ENOUGH`, the screen's condition.
+    """What a case must meet to be recommended: a gain margin of `ENOUGH`, `sweep.subject_to`.
 
     Args:
         data: the sweep.
@@ -459,8 +459,8 @@ def requirement(data: SweepData, by: str, is_safe: bool = True) -> str:
     Returns:
         As much of that, as a condition, as any case with this metric meets; "" for nothing.
     """
-    own = data.spec.screen.subject_to if data.spec.screen is not None else ""
     is_safe = is_safe and is_there(data, MARGIN)
+    own = data.spec.sweep.subject_to
     conditions = [x for x in (own, f"{MARGIN} >= {ENOUGH:g}" if is_safe else "") if x]
     for condition in dict.fromkeys((" and ".join(map(_bracket, conditions)), *conditions)):
         try:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 
+from studies.result import Result
+from studies.show.listing import Rows
+from studies.show.report import Report
 from studies.tuning.evaluate import Evaluation, Evaluator
 from studies.tuning.linear_fidelity import LinearFidelity
 from studies.tuning.optimise import start_families
@@ -38,6 +42,7 @@ MEANING = (
     f"two values, or, where both are small, to {100 * SMALLEST:g} % of the figure's largest "
     f"derivative and at least to {NEAR_ZERO:g}."
 )
+HEADS = ["parameter", "family", "worst for", "at", "derivative", "difference", "disagreement"]
 
 
 class Disagreement(NamedTuple):
@@ -50,6 +55,46 @@ class Disagreement(NamedTuple):
     derivative: float  # as a share of the bounds
     difference: float
     share: float  # disagreement as a share of the larger one
+
+
+@dataclass(frozen=True, eq=False)
+class Audit(Result):
+    """Derivatives beside finite differences."""
+
+    checks: list[Disagreement]
+
+    @property
+    def worst(self) -> float:
+        """Largest disagreement [1]."""
+        return max(check.share for check in self.checks)
+
+    @property
+    def is_good(self) -> bool:
+        return self.worst <= ALLOWED
+
+    def report(self) -> Report:
+        rows = [
+            [
+                *(x.name, x.family, x.figure, f"{x.place + 1}"),
+                *(f"{x.derivative:.6g}", f"{x.difference:.6g}", f"{x.share:.1e}"),
+            ]
+            for x in self.checks
+        ]
+        beside = "below" if self.is_good else "above"
+        return Report(
+            title="Derivatives beside finite differences",
+            result=[f"worst: {self.worst:.1e}, {beside} {ALLOWED:g}"],
+            question="",
+            next_steps="",
+            top=[Rows(HEADS, rows), f"Design 1 is close to the baseline. {MEANING}"],
+            chapters=[],
+            files={},
+        )
+
+
+def audited(spec: TuneSpec) -> Audit:
+    """The audit of a tuning at designs of `audit_places`."""
+    return Audit(audit(spec))
 
 
 def audit(

@@ -13,7 +13,7 @@ import scipy
 
 from jaxmodel import status
 from jaxmodel.case import Case, Structure
-from jaxmodel.simulate import Result
+from jaxmodel.simulate import RunResult
 from studies.engine.executor import Executor
 from studies.engine.plan import even_layout
 from studies.engine.poles import PoleReport, pole_report, tracked_modes
@@ -241,7 +241,7 @@ def _terms(spec: TuneSpec, loop: _DesignLoops, fresh: LoopMachines) -> np.ndarra
     )
 
 
-def _run_designs(designs: list[Study], columns: dict[str, np.ndarray], runs: PartRuns) -> Result:
+def _run_designs(designs: list[Study], columns: dict[str, np.ndarray], runs: PartRuns) -> RunResult:
     """Runs of designs in scenarios, then as in their own files; (designs, scenarios + 1, ...)."""
     every, count = [parts_of(study) for study in designs], len(columns["run.seed"])
     order, results = [], []
@@ -257,7 +257,7 @@ def _run_designs(designs: list[Study], columns: dict[str, np.ndarray], runs: Par
         results.append(jax.tree.map(lambda x, n=shape: x.reshape(*n, *x.shape[1:]), result))
         order += chosen
     back = np.argsort(order)
-    whole: Result = jax.tree.map(lambda *x: np.concatenate(x)[back], *results)
+    whole: RunResult = jax.tree.map(lambda *x: np.concatenate(x)[back], *results)
     return whole
 
 

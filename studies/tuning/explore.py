@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from studies.engine.folder import TUNING
 from studies.errors import StudyError
 from studies.explorer.replays import MOST_REPLAYS, replayed
 from studies.explorer.table import Column, ExplorerTable, Placement, text_column
+from studies.job import KINDS
 from studies.reading import parse_json, read_json
 from studies.results.labelled import Variable
 from studies.show.figures import is_wide
@@ -19,9 +21,10 @@ from studies.show.words import baseline_text
 from studies.store import read_store
 from studies.study.spec import Study
 from studies.tuning.check import tuned_study
-from studies.tuning.folder import MANIFEST, RESULTS
+from studies.tuning.folder import RESULTS
 from studies.tuning.spec import TuneSpec, parse_tuning
 
+MANIFEST = KINDS["tune"].mark
 #: Statuses of a starting point.
 _REASONS = {0: "descended", 1: "stopped: a run did not finish"}
 
@@ -73,13 +76,13 @@ def explore_tuning(folder: Path, on_progress: Callable[[int, int], None]) -> Exp
 def _is_stale(folder: Path, attributes: Mapping[str, Any]) -> tuple[str, ...]:
     """That the results are those of another file than the one the folder was last begun with."""
     try:
-        begun = read_json(folder / MANIFEST).get("spec")
+        begun = read_json(folder / TUNING).get("spec")
     except (OSError, ValueError, AttributeError):
         return ()
     if begun == parse_json(attributes["tuning"]):
         return ()
     return (
-        f"{folder / RESULTS} is of another tuning file than {folder / MANIFEST}: the tuning begun "
+        f"{folder / RESULTS} is of another tuning file than {folder / TUNING}: the tuning begun "
         "last is not finished. What is shown is the earlier one.",
     )
 

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
-from studies.publish import shown
+from studies.result import Result
 from studies.tuning.audit import Disagreement
 from studies.tuning.check import JudgedDesign, RandomSearch
 from studies.tuning.optimise import KEPT, Progress, excess
 from studies.tuning.references import References
 from studies.tuning.spec import LOOP_LIMITS, Family, TuneSpec
 
+NO_REFERENCES = References(None, None, None, None)
 
-class TuneFindings(NamedTuple):
+
+@dataclass(frozen=True, eq=False)
+class TuneFindings(Result):
     """Everything that a tuning found."""
+
+    FILES = "; tuned studies in the same folder"
 
     spec: TuneSpec
     at: Progress
@@ -27,10 +32,7 @@ class TuneFindings(NamedTuple):
     searched: RandomSearch | None
     run_time: float  # of a differentiated run [s]
     runs: int  # how many there were
-    references: References = References(None, None, None, None)  # what designs have to beat
-
-    def _repr_html_(self) -> str:
-        return shown(self)
+    references: References = NO_REFERENCES  # what designs have to beat
 
 
 def best_family(spec: TuneSpec, findings: TuneFindings) -> int:

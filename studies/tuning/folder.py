@@ -1,66 +1,25 @@
-"""The folder of a tuning: its request (`tune.json`) and progress (`progress.npz`)."""
+"""The folder of a tuning: its progress (`progress.npz`) and its designs."""
 
 from __future__ import annotations
 
 import copy
-import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from studies.engine.folder import TUNING, TUNINGS, locked_folder, refuse_existing
+from studies import job
 from studies.errors import StudyError
-from studies.publish import check_target, replacing
-from studies.reading import read_json, read_npz
+from studies.publish import replacing
+from studies.reading import read_npz
 from studies.study.files import is_as_written, signed
 from studies.study.spec import Study
 from studies.study.template import study_template
 from studies.tuning.optimise import Progress
 
-MANIFEST, PROGRESS, RESULTS = TUNING, "progress.npz", "tune.h5"
-#: Entries of the manifest that a resumed tuning must share to continue bit by bit.
-CHECKED = {"spec": "tuning file", "code": "program", "jaxlib": "jaxlib", "precision": "precision"}
-
-
-@contextmanager
-def open_tuning(out: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterator[Progress | None]:
-    """Create or check the folder and lock it; yields the progress of an interrupted tuning.
-
-    Raises:
-        StudyError: not writable, in use, holds something else or a different tuning.
-    """
-    with locked_folder(out, "tuning"):
-        path, before = out / MANIFEST, None
-        refuse_existing(out, TUNINGS, is_resumed)
-        if path.is_file():
-            try:
-                old = read_json(path)
-            except (OSError, ValueError):
-                raise StudyError(f"{path}: damaged; name a new folder") from None
-            now = json.loads(json.dumps(manifest))
-            for key, what in CHECKED.items():
-                if not isinstance(old, dict) or _fixed_part(old.get(key)) != _fixed_part(now[key]):
-                    raise StudyError(
-                        f"--out {out}: was begun with another {what}; name a new folder"
-                    )
-            before = load_progress(out / PROGRESS)
-            if before is not None:
-                _refuse_edited(out)
-        for left in out.iterdir():  # only once their owner is known
-            if TUNINGS.leftover.fullmatch(left.name) and left.is_file():
-                left.unlink()
-        check_target(out / RESULTS)
-        with replacing(path) as temporary:
-            temporary.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
-        try:
-            yield before
-        except StudyError:
-            if not (out / PROGRESS).exists():  # nothing to continue, so a corrected file can start
-                path.unlink(missing_ok=True)
-            raise
+PROGRESS, RESULTS = "progress.npz", "tune.h5"
+#: Entries of the request that a resumed tuning must share to continue bit by bit, in words.
+CHECKED = job.CHECKED | {"spec": "tuning file"}
 
 
 def write_designs(out: Path, designs: dict[str, Study], written: dict[str, str]) -> dict[str, str]:
@@ -82,7 +41,7 @@ def write_designs(out: Path, designs: dict[str, Study], written: dict[str, str])
     return texts
 
 
-def _refuse_edited(out: Path) -> None:
+def refuse_edited(out: Path) -> None:
     """Raise StudyError if resuming would overwrite what somebody has edited."""
     for path in sorted(out.glob("tuned*.toml")):
         if not is_as_written(path):
@@ -92,7 +51,7 @@ def _refuse_edited(out: Path) -> None:
             )
 
 
-def _fixed_part(part: Any) -> Any:
+def fixed_part(part: Any) -> Any:
     """What must not change: everything but the number of iterations, unless Adam uses it."""
     part = copy.deepcopy(part)
     tune = part.get("tune") if isinstance(part, dict) else None

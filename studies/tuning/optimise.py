@@ -357,7 +357,7 @@ def optimise(
         keep: called after each iteration.
     """
     at = begin(spec, evaluator) if at is None else _resize(at, spec.tune.iterations)
-    while int(at.iteration) < spec.tune.iterations and not is_settled(spec, at):
+    while not has_ended(spec, at):
         at = advance(spec, evaluator, at)
         keep(at)
     return _hand_on(spec, at)
@@ -386,7 +386,7 @@ def _resize(at: Progress, iterations: int) -> Progress:
     return at._replace(history=history)
 
 
-def is_settled(spec: TuneSpec, at: Progress) -> bool:
-    """Whether further iterations are useless; Adam's steps are planned to the end."""
+def has_ended(spec: TuneSpec, at: Progress) -> bool:
+    """Whether all iterations are done, or further ones are useless; Adam needs all of them."""
     has_waited = spec.tune.method == "lbfgs" and (at.iteration - at.gained > PATIENCE).all()
-    return bool(at.is_frozen.all() or has_waited)
+    return bool(at.iteration >= spec.tune.iterations or at.is_frozen.all() or has_waited)

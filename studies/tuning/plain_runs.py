@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.simulate import Result
+from jaxmodel.simulate import RunResult
 from studies.engine.executor import Executor
 from studies.engine.plan import even_layout
 from studies.study.cases import build_cases, in_working_precision
@@ -14,7 +14,9 @@ from studies.tuning.scenarios import lane_columns
 from studies.tuning.spec import TuneSpec
 
 
-def baseline_runs(spec: TuneSpec, structure: Structure, columns: dict[str, np.ndarray]) -> Result:
+def baseline_runs(
+    spec: TuneSpec, structure: Structure, columns: dict[str, np.ndarray]
+) -> RunResult:
     """Runs of a tuning's baseline in scenarios, by a program of its law and drive.
 
     Args:
@@ -40,7 +42,7 @@ class PlainRuns:
         self._layout = even_layout(count)
         self._executor = Executor(structure, self._layout)
 
-    def run(self, cases: Case, count: int) -> Result:
+    def run(self, cases: Case, count: int) -> RunResult:
         """Run cases, leaves (count or 1, ...)."""
         cases = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape[1:])), cases)
         parts = []

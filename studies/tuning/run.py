@@ -1,4 +1,4 @@
-"""A tuning in its folder: `tune.json` (the request), `progress.npz` (the descent), `phases.npz`
+"""A tuning in its folder: `tune.json` (the request), `progress.npz` (the descent), `parts/`
 (what followed it), `tune.h5` (every start), `study.toml` (the reference), `tuned.toml` (the study
 with the best numbers, one file per family, from the first better design on), the report
 (`report.html`) and its figures.
@@ -13,19 +13,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
-from studies import config
-from studies.cluster.connect import Place, on_workers
-from studies.engine.folder import make_manifest
-from studies.engine.progress import Phases, duration_text
+from studies.cluster.connect import TIMEOUT, Place, on_workers
 from studies.engine.run_data import run_attributes
 from studies.errors import StudyError
+from studies.job import Job, make_request
+from studies.phases import duration_text
 from studies.publish import publish
+from studies.result import in_folder
 from studies.show.pages import write_report
-from studies.show.report import Report, print_result
+from studies.show.report import plain
 from studies.show.units import count_text
-from studies.store import write_store
+from studies.store import numbers_digest, write_store
 from studies.study.files import signed
 from studies.study.spec import Study
 from studies.study.template import study_template
@@ -33,14 +32,20 @@ from studies.tuning.audit import Disagreement, audit
 from studies.tuning.check import RandomSearch, search, tuned_study
 from studies.tuning.evaluate import Evaluator
 from studies.tuning.findings import TuneFindings, violated_limits
-from studies.tuning.folder import PROGRESS, RESULTS, open_tuning, save_progress, write_designs
+from studies.tuning.folder import (
+    PROGRESS,
+    RESULTS,
+    load_progress,
+    refuse_edited,
+    save_progress,
+    write_designs,
+)
 from studies.tuning.optimise import Progress, is_compatible, optimise, start_families
-from studies.tuning.phases import KeptPhases
 from studies.tuning.references import compare
 from studies.tuning.results import variables
 from studies.tuning.say import ended, file_name, say
 from studies.tuning.spec import TuneSpec
-from studies.tuning.workers import ClusterEvaluator
+from studies.tuning.workers import ClusterEvaluator, evaluate_part
 
 #: Share of the evaluations of a descent that the comparison of its derivatives takes.
 SHARE = 0.1
@@ -53,50 +58,49 @@ def make_evaluator(spec: TuneSpec) -> Evaluator:
     return Evaluator(spec, [spec.moving[k] for k in start_families(spec)])
 
 
-def run_tuning(
+def tune_request(spec: TuneSpec) -> dict[str, Any]:
+    """What determines the numbers of a tuning."""
+    return make_request(spec.data, DECISIVE)
+
+
+def tuned_into(
     spec: TuneSpec,
-    out: str | Path,
-    is_resumed: bool = False,
-    console: Console | None = None,
-    is_quiet: bool = False,
+    job: Job,
     workers: Place = None,
+    timeout: float = TIMEOUT,
     evaluator: Evaluator | None = None,
 ) -> TuneFindings:
     """Tune, check the result on fresh scenarios, and write it.
 
     Args:
         spec: of the tuning.
-        out: folder.
-        is_resumed: continue the existing tuning.
-        console: where progress goes; default: standard output.
-        is_quiet: hide progress.
-        workers: as in `run_sweep`; default: this process.
+        job: with `tune_phases`.
+        workers: as in `studies.tune`.
+        timeout: of the workers [s].
         evaluator: of all starting points, in place of workers.
 
-    Returns:
-        What was found.
+    Raises:
+        StudyError: a fault of the study or of the folder.
+    """
+    before = load_progress(job.place / PROGRESS)
+    if before is not None and not is_compatible(spec, before):
+        raise StudyError(f"{job.place / PROGRESS}: damaged; name a new folder")
+    if before is not None:
+        refuse_edited(job.place)
+    with on_workers(workers, timeout, job.say, evaluate_part) as remote:
+        evaluator = evaluator or (ClusterEvaluator(spec, remote) if remote else None)
+        return _tune(spec, before, evaluator, job)
+
+
+def refuse_violated(findings: TuneFindings, job: Job) -> TuneFindings:
+    """The findings, if their limits can be satisfied together; job: that found them.
 
     Raises:
-        StudyError: the folder holds something else or cannot be written to; a fault of the study;
-            contradictory limits (everything is written nevertheless).
+        StudyError: they cannot; what was found is said.
     """
-    config.require_configured()
-    out = Path(out)
-    console = console or Console(highlight=False, markup=False)
-    manifest = make_manifest(spec.data, DECISIVE)
-
-    phases = Phases(console, tune_phases(spec), is_quiet)
-    remote = partial(ClusterEvaluator, spec, phases.say)
-    with (
-        phases,
-        on_workers(workers, False, phases.say, remote, evaluator) as found,
-        open_tuning(out, manifest, is_resumed) as before,
-    ):
-        if before is not None and not is_compatible(spec, before):
-            raise StudyError(f"{out / PROGRESS}: damaged; name a new folder")
-        findings = _tune(spec, out, before, found, phases)
-    faults = violated_limits(spec, findings.at)
-    if faults:
+    if faults := violated_limits(findings.spec, findings.at):
+        for text in say(findings).result:
+            job.say(plain(text))
         raise StudyError("tune.limits: not satisfied together; " + "; ".join(faults))
     return findings
 
@@ -108,19 +112,16 @@ def tune_phases(spec: TuneSpec) -> tuple[str, ...]:
 
 
 def _tune(
-    spec: TuneSpec,
-    out: Path,
-    before: Progress | None,
-    evaluator: Evaluator | None,
-    phases: Phases,
+    spec: TuneSpec, before: Progress | None, evaluator: Evaluator | None, job: Job
 ) -> TuneFindings:
-    """Tune, check and write, in an open folder; arguments as in `run_tuning`."""
+    """Tune, check and write; before: progress of an interrupted tuning."""
+    out = job.place
     if before is not None:
-        phases.say(f"continuing after iteration {int(before.iteration)}")
-    phases.begin("compile", "starting points by the linear loop, and the first iteration")
+        job.say(f"continuing after iteration {int(before.iteration)}")
+    job.begin("compile", "starting points by the linear loop, and the first iteration")
     evaluator, clock = evaluator or make_evaluator(spec), _Clock()
     left = spec.tune.iterations - (0 if before is None else int(before.iteration))
-    phases.say(
+    job.say(
         f"{count_text(len(evaluator.families), 'starting point')}: {evaluator.lanes} runs with "
         f"derivatives in each of at most {count_text(left, 'iteration')}; how long these take is "
         "known from the second one on"
@@ -131,10 +132,10 @@ def _tune(
     def keep(at: Progress) -> None:
         save_progress(out / PROGRESS, at)
         written.update(write_designs(out, tuned_studies(spec, at, is_over=False), written))
-        if phases.present == "compile":  # the first iteration compiles
-            phases.begin("descend")
+        if job.phases.present == "compile":  # the first iteration compiles
+            job.begin("descend")
         done, total = int(at.iteration), spec.tune.iterations
-        phases.advance(done, total, _progress_text(spec, at), clock.left(total - done))
+        job.advance(done, total, _progress_text(spec, at), clock.left(total - done))
 
     at = optimise(spec, evaluator, before, keep)
     lost = [f.name for k, f in enumerate(spec.moving) if not _has_finished(at, k)]
@@ -143,13 +144,10 @@ def _tune(
             f"tune.starts: no starting point of {', '.join(lost)} finished a run; the study "
             "with the family's settings should be one that does (try studies simulate)"
         )
-    phases.say(ended(spec, at))
-    findings = find(spec, evaluator, at, phases, KeptPhases(out, at))
-    phases.begin("draw")
-    report = say(findings, str(out))
-    _write(findings, report, out)
-    if not phases.is_quiet:
-        print_result(report, phases.console)
+    job.say(ended(spec, at))
+    findings = find(spec, evaluator, at, job)
+    job.begin("draw")
+    _write(in_folder(findings, out), out)
     return findings
 
 
@@ -188,40 +186,38 @@ def _progress_text(spec: TuneSpec, at: Progress) -> str:
     )
 
 
-def find(
-    spec: TuneSpec, evaluator: Evaluator, at: Progress, phases: Phases, kept: KeptPhases
-) -> TuneFindings:
+def find(spec: TuneSpec, evaluator: Evaluator, at: Progress, job: Job) -> TuneFindings:
     """Judge the result of a tuning.
 
     Args:
         spec: of the tuning.
         evaluator: of its starting points.
         at: where the tuning ended.
-        phases: those of `tune_phases`.
-        kept: what phases have found before.
+        job: with `tune_phases`.
     """
     main = int(np.flatnonzero(at.family == spec.main)[0])
+    end = numbers_digest({"place": at.best_place, "iteration": at.iteration})
 
     def searched() -> RandomSearch:
-        phases.begin("random designs", f"{spec.tune.samples} for comparison")
+        job.begin("random designs", f"{spec.tune.samples} for comparison")
         return search(spec, evaluator.linear, main)
 
     def audited() -> list[Disagreement]:
-        phases.begin("compare derivatives", "with differences")
+        job.begin("compare derivatives", "with differences")
         most = max(1, int(SHARE * at.iteration)) * len(at.family)
         return audit(spec, at.best_place[[at.winner(spec.main)]], most)
 
     return TuneFindings(
         spec=spec,
         at=at,
-        **kept.find("check", lambda: _checked(spec, evaluator, at, phases)),
-        searched=kept.find("random designs", searched) if spec.tune.samples else None,
-        audited=kept.find("compare derivatives", audited),
+        **job.part("check", lambda: _checked(spec, evaluator, at, job), end),
+        searched=job.part("random designs", searched, end) if spec.tune.samples else None,
+        audited=job.part("compare derivatives", audited, end),
         runs=int(at.iteration) * evaluator.lanes,
     )
 
 
-def _checked(spec: TuneSpec, evaluator: Evaluator, at: Progress, phases: Phases) -> dict[str, Any]:
+def _checked(spec: TuneSpec, evaluator: Evaluator, at: Progress, job: Job) -> dict[str, Any]:
     """The best designs on fresh machines, and by the linear loop."""
     values = spec.free.values(at.best_place)
     winners = [at.winner(k) for k in range(len(spec.moving))]
@@ -229,7 +225,7 @@ def _checked(spec: TuneSpec, evaluator: Evaluator, at: Progress, phases: Phases)
         tuned_study(spec, family, values[winners[k]] if k < len(winners) else values[0])
         for k, family in enumerate(spec.families)
     ]
-    baseline, judged, references = compare(spec, designs, partial(phases.begin, "check"))
+    baseline, judged, references = compare(spec, designs, partial(job.begin, "check"))
     linear = np.concatenate(
         [
             evaluator.linear.screen(
@@ -272,11 +268,11 @@ def tuned_studies(spec: TuneSpec, at: Progress, is_over: bool = True) -> dict[st
     return studies
 
 
-def _write(findings: TuneFindings, report: Report, out: Path) -> None:
+def _write(findings: TuneFindings, out: Path) -> None:
     spec = findings.spec
     attributes = run_attributes(spec.study) | {"tuning": json.dumps(spec.data)}
     with publish(out) as staging:
         for name, study in tuned_studies(spec, findings.at).items():
             (staging / name).write_text(signed(study_template(study)), encoding="utf-8")
         write_store(staging / RESULTS, variables(spec, findings), attributes)
-        write_report(report, staging)
+        write_report(say(findings), staging)

@@ -50,14 +50,9 @@ NOMINAL = """All machines are nominal: `tune.scenarios` names nothing in which t
 figures say nothing of robustness."""
 
 
-def say(findings: TuneFindings, folder: str = "") -> Report:
-    """What a tuning tells.
-
-    Args:
-        findings: what it found.
-        folder: that holds the tuned studies, for commands.
-    """
-    spec = findings.spec
+def say(findings: TuneFindings) -> Report:
+    """What a tuning tells."""
+    spec, folder = findings.spec, findings.folder
     best = spec.families[best_family(spec, findings)]
     file = f"{folder}/{file_name(spec, best)}" if folder else file_name(spec, best)
     return Report(
@@ -65,7 +60,7 @@ def say(findings: TuneFindings, folder: str = "") -> Report:
         result=_result(findings),
         question=_question(findings),
         next_steps=f"""`studies simulate {file} --out run.h5 --report` for its trajectories,
-        `studies spillover {file} --out certificate` before it runs on a machine, `studies export
+        `studies certify {file} --out certificate` before it runs on a machine, `studies export
         {file} --target c --out dsp` for the controller.""",
         top=[machine(partial(_best_study, findings), "The best design is shown")],
         chapters=[

@@ -7,7 +7,7 @@
 - The loop: `plan` is what acts from outside, `electronics` the analogue chain, `law` the compiled
   controller, `reading` the signals, `loop` steps all of it.
 - The comparison: `compare` runs both models, `ringing` finds poles in signals, `margin` damping
-  and gain margin; `report` and `plots` present them, `commands` is `studies twin`.
+  and gain margin; `report` and `plots` present them, `verb` is `studies.twin` and the command.
 
 To compare another quantity, add it to `compared` in `report`; another change, to `causes` in
 `compare`.

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
 from studies.engine.stability import LoopFigures
+from studies.result import Result
 from studies.study.spec import Study
 from studies.twin.compare import BothRuns, ChangedRun, in_window
 from studies.twin.margin import GrowthMargin
@@ -17,8 +18,11 @@ from studies.twin.plan import TwinPlan
 FIGURE = "twin"
 
 
-class TwinResult(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class TwinResult(Result):
     """A study and its twin."""
+
+    FILES = ", numbers and figure in the same folder"
 
     study: Study
     plan: TwinPlan

@@ -183,7 +183,7 @@ def say(result: TwinResult) -> Report:
         question=f"""{motion_text(study)}; {control_text(study)}: does the loop do the same where
         somebody else's code is the machine, and the exported C code the controller?""",
         next_steps="""if the differences below are small beside what you decide by, carry on:
-        `studies spillover DESIGN --out DIR` certifies the controller on machines that differ from
+        `studies certify DESIGN --out DIR` certifies the controller on machines that differ from
         its model. If not, the second table says which assumption they come from.""",
         top=[],
         chapters=[

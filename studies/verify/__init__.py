@@ -3,8 +3,8 @@
 - `rows` is the table; `links`, `trajectories`, `outside` (published and
   finite-element figures), `machine` (mechanics), `stepping` (time steps, kernels, metrics) and
   `loops` (margins, exported C) fill it, each one way of checking: a function of a study.
-- `run` puts them together: `verify_study(study)`; `passport` keeps the outcome for later reports;
-  `commands` is `studies verify`.
+- `run` puts them together, `say` presents them; `passport` keeps the outcome for later reports;
+  `verb` is `studies.verify` and the command.
 
 docs/theory.md, section 11, gives the reason for each limit.
 """

@@ -1,3 +1,3 @@
+from .result import ModelVerification as ModelVerification
 from .rows import Assumption as Assumption
-from .run import ModelVerification as ModelVerification
-from .run import verify_study as verify_study
+from .verb import verify as verify

@@ -16,10 +16,10 @@ from jaxmodel.linear import linearise, natural_modes
 from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import prepare
 from jaxmodel.simulate import simulate
-from studies.bench.works import BARE
 from studies.engine.programs import kept_jit
 from studies.engine.stability import loop_report
 from studies.reference import slider_crank, tables
+from studies.reference.tables import BARE
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study, paper_study
 from studies.verify.rows import Assumption, largest, worst_relative

@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from datetime import datetime
+from functools import partial
 
 import numpy as np
 
-from studies import __version__, passport
-from studies.config import processor_text, require_configured
-from studies.engine.preflight import check_run
+from studies import passport
 from studies.errors import StudyError
-from studies.passport import Passport
-from studies.results.labelled import Labelled, derived, told, unwritten
-from studies.study.spec import Study, paper_study
+from studies.job import Job
+from studies.publish import publish
+from studies.result import in_folder
+from studies.results.document import json_text
+from studies.show.pages import write_report
+from studies.study.spec import Study
 from studies.verify.links import check_links
 from studies.verify.loops import check_loops
 from studies.verify.machine import check_machine
 from studies.verify.outside import check_outside
+from studies.verify.result import ModelVerification
 from studies.verify.rows import Assumption
+from studies.verify.say import say
 from studies.verify.stepping import check_stepping
 from studies.verify.trajectories import check_trajectories
 
+DOCUMENT = "verification.json"
 #: What is checked, in this order, by names for progress.
 CHECKS: dict[str, Callable[[Study], list[Assumption]]] = {
     "links and patches": check_links,
@@ -32,72 +36,46 @@ CHECKS: dict[str, Callable[[Study], list[Assumption]]] = {
     "figures of others": check_outside,
 }
 
-
-class ModelVerification(Labelled, command="verify", version=2):
-    """What `studies verify --json` prints: every assumption of the model, what it was checked
-    against and how far apart both are.
-    """
-
-    study: Study = unwritten()
-    table: tuple[Assumption, ...] = told("a row for each assumption")
-
-    @derived("", "whether no row failed; the exit code is 1 otherwise")
-    def is_passed(self) -> bool:
-        return all(row.is_passed for row in self.table)
-
-    @derived("", "the outcome as later reports show it")
-    def summary(self) -> Passport:
-        checked = [row for row in self.table if not row.left_out]
-        failed = tuple(row.assumption for row in checked if not row.is_passed)
-        return Passport(
-            title=self.study.title,
-            passed=len(checked) - len(failed),
-            rows=len(checked),
-            failed=failed,
-            date=datetime.now().astimezone().date().isoformat(),
-            version=__version__,
-            processor=processor_text(),
-        )
+#: What each takes on two cores [s].
+PHASES = dict(zip(CHECKS, (10.0, 2.0, 16.0, 50.0, 70.0, 20.0), strict=True))
+#: Modules that determine the numbers, with everything they import.
+DECISIVE = ("studies.verify.run",)
 
 
-def verify_study(
-    study: Study | None = None, on_progress: Callable[[str], None] = lambda _: None
-) -> ModelVerification:
-    """Check every assumption of the model on a study's machine, motion and controller.
+def verified(study: Study, job: Job) -> ModelVerification:
+    """Check every assumption of the model; the outcome is kept for later reports.
 
     Args:
-        study: to verify; None: the paper's machine.
-        on_progress: called with what is checked next.
-
-    Returns:
-        ModelVerification: a row per assumption; its outcome is kept for later reports.
-
-    Raises:
-        StudyError: a study that cannot run.
-
-    Example:
-        >>> verify_study(load_study("mine.toml")).is_passed  # doctest: +SKIP
-        True
+        study: that can run.
+        job: with `PHASES`.
     """
-    require_configured()
-    study = study or paper_study()
-    check_run(study)
     rows: list[Assumption] = []
     for name, check in CHECKS.items():
-        on_progress(name)
-        try:
-            rows += check(study)
-        except (StudyError, FloatingPointError, np.linalg.LinAlgError, ValueError) as error:
-            rows.append(
-                Assumption(
-                    assumption=name,
-                    against="-",
-                    source="-",
-                    difference=np.inf,
-                    allowed=0.0,
-                    note=f"it could not be checked: {error}",
-                )
-            )
+        job.begin(name)
+        rows += job.part(name, partial(_rows, name, check, study))
     found = ModelVerification(study, tuple(rows))
     passport.keep(study, found.summary)
-    return found
+    if job.folder is None:
+        return found
+    with publish(job.folder) as staging:
+        (staging / DOCUMENT).write_text(json_text(found), encoding="utf-8")
+        write_report(say(found), staging)
+    return in_folder(found, job.folder)
+
+
+def _rows(name: str, check: Callable[[Study], list[Assumption]], study: Study) -> list[Assumption]:
+    """Rows of a check, or the row that says why it could not be made."""
+    try:
+        return check(study)
+    except (StudyError, FloatingPointError, np.linalg.LinAlgError, ValueError) as error:
+        note = f"it could not be checked: {error}"
+        return [
+            Assumption(
+                assumption=name,
+                against="-",
+                source="-",
+                difference=np.inf,
+                allowed=0.0,
+                note=note,
+            )
+        ]

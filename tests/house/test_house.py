@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 import ast
+import inspect
 from collections import defaultdict
 
+import pytest
+import typer
+
+from studies import cli
+from studies.commands import documented
+from studies.job import KINDS
 from tests import TOP
 
 SOURCES = {
@@ -86,3 +93,51 @@ def test_formatting_has_no_exceptions():
         for path in (TOP / folder).rglob("*.py")
     ]
     assert [path for path in files if mark in path.read_text(encoding="utf-8")] == []
+
+
+# --- verbs ----------------------------------------------------------------------------------------
+
+#: All but `bench`, which needs neither a study nor a folder.
+VERBS = {verb.__name__: verb for verb in cli.VERBS if verb.__name__ != "bench"}
+#: What one verb calls otherwise than another: its own kind of file; the margin of a gain or a disk.
+OWN = {"what", "margin"}
+
+
+def arguments(verb):
+    return inspect.signature(verb).parameters.values()
+
+
+@pytest.mark.parametrize("name", VERBS)
+def test_verbs_take_their_arguments_in_one_order(name):
+    first, second, *options = arguments(VERBS[name])
+    assert (first.name, second.name, second.default) == ("what", "out", None)
+    assert {first.kind, second.kind} == {inspect.Parameter.POSITIONAL_OR_KEYWORD}
+    assert {x.kind for x in options} == {inspect.Parameter.KEYWORD_ONLY}
+    names = [x.name for x in (first, second, *options)]
+    assert name not in KINDS or names[-2:] == ["resume", "progress"]
+    about, texts = documented(VERBS[name])
+    assert about and sorted(texts) == sorted(names) and all(texts.values())
+
+
+def test_work_that_is_resumed_has_a_verb_of_that_name():
+    assert VERBS.keys() >= KINDS.keys()
+    assert {name for name, x in VERBS.items() if "resume" in documented(x)[1]} == KINDS.keys()
+
+
+def test_an_option_is_the_same_wherever_it_stands():
+    found = defaultdict(set)
+    for verb in VERBS.values():
+        for x in arguments(verb):
+            found[x.name].add((x.default, x.annotation))
+    assert {name for name, kinds in found.items() if len(kinds) > 1} == OWN
+
+
+@pytest.mark.parametrize("verb", cli.VERBS, ids=lambda verb: verb.__name__)
+def test_a_command_has_the_options_of_its_verb(verb):
+    command = typer.main.get_command(cli.app).commands[verb.__name__]
+    names = [x.name for x in arguments(verb)] + ["precision"] * cli.VERBS[verb] + ["as_json"]
+    assert [x.name for x in command.params] == names
+    for x in command.params:
+        flag = "--json" if x.name == "as_json" else f"--{x.name.replace('_', '-')}"
+        assert x.opts == (["what"] if x.name == "what" else [flag]), x.name
+        assert x.secondary_opts in ([], [flag.replace("--", "--no-")])

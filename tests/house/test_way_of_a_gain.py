@@ -88,7 +88,7 @@ def small_blocks():
 def test_few_modules_hold_a_gain_between_its_file_and_its_results(tmp_path):
     path = tmp_path / "gains.toml"
     path.write_text(toml_text(small({"axes": {"gain": list(GAINS)}})))
-    command = ["sweep", str(path), "--quiet", "--out"]
+    command = ["sweep", str(path), "--no-progress", "--out"]
     main([*command, str(tmp_path / "compiled")])  # calls that trace programs are not its way
     way = Way()
     threading.setprofile(way)
@@ -98,7 +98,9 @@ def test_few_modules_hold_a_gain_between_its_file_and_its_results(tmp_path):
     finally:
         sys.setprofile(None)
         threading.setprofile(None)
-    np.testing.assert_array_equal(studies.load(tmp_path / "sweep")["control.gain_factor"], GAINS)
+    np.testing.assert_array_equal(
+        studies.load(tmp_path / "sweep").data["control.gain_factor"], GAINS
+    )
     modules = dict.fromkeys(way.modules)  # two threads may note one at once
     print(f"{len(modules)} modules:", *modules, sep="\n  ")
     assert len(modules) <= LIMIT

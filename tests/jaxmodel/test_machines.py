@@ -33,12 +33,12 @@ from studies.study.spec import load_study
 from studies.study.template import study_template
 from studies.sweeps.dry_run import axis_rows
 from studies.sweeps.plots import plot
-from studies.sweeps.run import run_sweep
-from studies.tuning.run import run_tuning
+from studies.tuning import verb
 from studies.tuning.spec import parse_tuning
 from tests import forms
 from tests.bare import parse_study
 from tests.machines import random_machine
+from tests.sweeps import run_sweep
 
 SEEDS = range(10)
 R = 3
@@ -139,7 +139,7 @@ def test_a_sweep_over_machines_is_their_single_runs(tmp_path):
     axes = {name: values for name, values in axes.items() if len(set(values)) > 1}
     assert len(axes) == 20
     spec = parse_sweep(sections(studies[0]) | {"sweep": {"method": "zip", "axes": axes}})
-    run_sweep(spec, tmp_path, is_quiet=True)
+    run_sweep(spec, tmp_path)
     swept = read_sweep(tmp_path)
     assert set(swept["status"]) == {status.OK}
     for case in (0, 7):
@@ -187,7 +187,7 @@ def test_entries_of_one_number_for_all_links_are_swept():
 @pytest.mark.long
 def test_a_sweep_of_entries_is_its_single_runs(tmp_path):
     study, spec = one_thickness()
-    run_sweep(spec, tmp_path, is_quiet=True)
+    run_sweep(spec, tmp_path)
     data = read_sweep(tmp_path)
     same = run_study(study.change(link__thickness=(2.1e-3, 2.2e-3, 2e-3)), False, False)
     np.testing.assert_allclose(data["residual_rms"][3], same.result.metrics.residual_rms, rtol=1e-8)
@@ -225,7 +225,7 @@ def tune(study, folder):
         "limits": {"gain_margin": 1.5},
         "scenarios": {"count": 1, "check": 2, "spread": {"link.youngs_modulus": 2.0}},
     }
-    run_tuning(parse_tuning(sections(study) | {"tune": tuning}), folder, is_quiet=True)
+    verb.tune(parse_tuning(sections(study) | {"tune": tuning}), folder, progress=False)
 
 
 @pytest.mark.long

@@ -26,10 +26,10 @@ from studies.space.spec import parse_sweep
 from studies.space.table import build_table, case_study
 from studies.study.cases import as_arrays, build_case
 from studies.study.spec import Study
-from studies.sweeps.run import run_sweep
 from tests.bare import parse_study
 from tests.jaxmodel.kept import bases_of, design_of, nominal_of, prepared
 from tests.jaxmodel.kept import without_run as arrays
+from tests.sweeps import run_sweep
 
 #: Of links whose laws have a model.
 DRAINED = {"amplifier_hz": 3_000.0, "sensor_highpass_hz": 5.0}
@@ -476,7 +476,7 @@ def test_runs_of_a_sweep_over_poles(tmp_path):
         "metrics": {"residual_delay": 0.003, "residual_length": 0.03},
     }
     spec = parse_sweep({**short, "sweep": {"axes": DECAYS}})
-    run_sweep(spec, tmp_path / "sweep", is_quiet=True)
+    run_sweep(spec, tmp_path / "sweep")
     found = read_sweep(tmp_path / "sweep")
     table, rms = found.table, found["residual_modal_rms"]
     assert len(table) == 6 and np.all(found["status"] == OK)

@@ -39,7 +39,7 @@ MACHINES = {
 @pytest.mark.parametrize("changes", MACHINES.values(), ids=MACHINES)
 def test_the_drive_has_settled_by_the_poles_of_the_flexible_machine(changes):
     study = Study().change(link__modes=3, **changes)
-    modes = studies.machine_modes(study, pose=study.motion.waypoints[-1])
+    modes = studies.modes(study, pose=study.motion.waypoints[-1])
     decay = (2 * np.pi * modes.frequency * modes.damping_ratio)[:3]  # the drive's modes are lowest
     assert settling_time(study) == pytest.approx(np.log(1 / SETTLED) / decay.min(), rel=0.01)
     assert 0 <= residual_delay(study) - settling_time(study) < 1e-3

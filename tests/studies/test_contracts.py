@@ -20,6 +20,7 @@ from jaxmodel.metrics import METRICS, Metric, Total
 from jaxmodel.table import Parameter, PartError, Table, is_real
 from studies import config, sources
 from studies.cli import main
+from studies.cluster.runner import run_chunk
 from studies.engine.columns import PER_CASE
 from studies.engine.design import Design
 from studies.engine.executor import Executor
@@ -29,10 +30,12 @@ from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.results import read_sweep
 from studies.engine.runs import run_study
 from studies.errors import StudyError
-from studies.export.job import ExportResult
+from studies.export.request import ExportResult
 from studies.export.run import export_design
 from studies.export.targets import TARGETS, Target
 from studies.extensions import VARIABLE, extend
+from studies.laws.tuning import descend
+from studies.screen.workers import run_shard
 from studies.space.methods import METHODS
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table
@@ -41,6 +44,7 @@ from studies.study.cases import build_case, build_structure
 from studies.study.labels import RESERVED
 from studies.study.template import study_template
 from studies.tuning.spec import parse_tuning
+from studies.tuning.workers import evaluate_part
 from tests import TOP
 from tests.bare import parse_study
 from tests.canonical import MACHINE, study_of, text_of
@@ -151,7 +155,7 @@ def test_every_law_is_exported(name, tmp_path, capsys):
 def test_laws_are_a_choice_like_any_other(tmp_path):
     """All of them in one sweep, each with its own margin; the short one sweeps a user's law."""
     text = SMALL + '[sweep]\n[sweep.axes]\n"control.law" = "all"\ngain = [1.0]\n'
-    main(["sweep", written(tmp_path, text), "--out", str(tmp_path / "sweep"), "--quiet"])
+    main(["sweep", written(tmp_path, text), "--out", str(tmp_path / "sweep"), "--no-progress"])
     data = read_sweep(tmp_path / "sweep")
     assert list(data["control.law"]) == ALONE
     margin = dict(zip(ALONE, data["gain_margin"], strict=True))
@@ -203,7 +207,7 @@ def check_scan(data):
 
 @pytest.mark.long  # in short: its parameter varies in a sweep, traced as in a tuning
 def test_own_law_is_tuned_by_gradient(own, tmp_path, capsys):
-    run(capsys, own, "tune", written(tmp_path, TUNE), "--out", tmp_path / "tuned", "--quiet")
+    run(capsys, own, "tune", written(tmp_path, TUNE), "--out", tmp_path / "tuned", "--no-progress")
     arrays, _ = read_store(tmp_path / "tuned" / "tune.h5")
     objective = arrays["fresh_objective"].data
     assert np.all(np.isfinite(objective))
@@ -353,7 +357,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxmodel.laws.contract import Law, modal_feedback
 from jaxmodel.metrics import Metric, Total
-from studies.export.job import ExportResult
+from studies.export.request import ExportResult
 from studies.export.targets import Target
 from studies.space.methods import Method
 
@@ -439,13 +443,13 @@ def test_every_source_of_a_number_is_in_the_digest(tmp_path):
             sources.TOP / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__")
         )
     sweeps = DECISIVE
-    workers = ("studies.cluster.worker", "studies.tuning.workers")
+    workers = tuple(one.__module__ for one in (run_chunk, run_shard, evaluate_part, descend))
     before = {roots: sources.digest(*roots, top=tmp_path) for roots in (sweeps, workers)}
     for name, roots in (
         ("jaxmodel/laws/ppf.py", sweeps),
         ("jaxmodel/laws/__init__.py", sweeps),
         ("studies/engine/preflight.py", sweeps),
-        ("studies/engine/screen.py", sweeps),
+        ("studies/engine/fidelity.py", sweeps),
         ("studies/study/consistency.py", sweeps),
         ("studies/kernels/derivatives.py", sweeps),
         ("studies/engine/function.py", workers),

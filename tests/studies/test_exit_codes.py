@@ -1,31 +1,37 @@
 """What a command's exit code says, and retries on a cluster; nothing is compiled here."""
 
 import os
-import re
+import shlex
 import threading
 from collections import Counter
-from contextlib import contextmanager
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from rich.console import Console
 
+import studies
 from jaxmodel import status
-from studies.cluster import runner as cluster_runner
-from studies.cluster.runner import AHEAD, ClusterRunner
-from studies.cluster.worker import ChunkDone
+from studies.cluster import remote
+from studies.cluster.remote import AHEAD, Remote, call
+from studies.cluster.runner import ClusterRunner, run_chunk
 from studies.engine.chunks import Done, Lost
 from studies.engine.plan import Layout, plan_groups
-from studies.engine.progress import Phases, Reporter
+from studies.engine.progress import Reporter
 from studies.engine.results import read_sweep
+from studies.errors import StudyError
+from studies.phases import Phases
+from studies.result import Result, in_folder
 from studies.single import run as single_run
+from studies.single.run import Simulation
 from studies.space.table import build_table
 from studies.spillover import run as spillover_run
 from studies.sweeps import run as sweep_run
-from studies.sweeps.run import Outcome
+from studies.sweeps.result import SweepResult
 from studies.tuning import audit as audit_module
 from studies.tuning.audit import ALLOWED, Disagreement, audit
+from studies.tuning.evaluate import Evaluation, Evaluator
+from studies.tuning.workers import ClusterEvaluator, evaluate_part
 from tests.canonical import TINY, text_of
 from tests.studies.test_cli import run
 from tests.sweeps import small_spec
@@ -65,51 +71,53 @@ class Losing:
 def test_a_sweep_with_lost_cases_fails_and_says_how_to_retry(
     capsys, monkeypatch, sweep_file, tmp_path
 ):
-    @contextmanager
-    def losing(*_):
-        yield Losing()
-
-    monkeypatch.setattr(sweep_run, "on_workers", losing)
+    monkeypatch.setattr(sweep_run, "LocalRunner", Losing)
     out = tmp_path / "out"
     code, text, err = run(capsys, "sweep", sweep_file, "--out", out)
     assert code == 1
-    remedy = f"6 of 6 cases were left out, see above; retry them with --resume --out {out}"
-    assert err == f"studies: {remedy}\n"
+    again = f"studies sweep {sweep_file} --out {out} --resume"
+    assert err == f"studies: 6 of 6 cases were left out, see above; retry them with: {again}\n"
     assert "no room" in text and "0 cases in" in text
     np.testing.assert_array_equal(read_sweep(out)["status"], -1)
     # and again, where they are lost again
     assert run(capsys, "sweep", sweep_file, "--out", out, "--resume")[0] == 1
 
 
-@pytest.mark.parametrize(
-    ("lost", "is_interrupted", "wanted"),
-    [(0, False, 0), (2, False, 1), (0, True, 130), (2, True, 130)],
-)
-def test_how_a_sweep_ended(capsys, monkeypatch, sweep_file, tmp_path, lost, is_interrupted, wanted):
-    def ended(spec, *_, **__):
-        return Outcome(
-            out=tmp_path,
-            table=build_table(spec),
-            n_done=6 - lost,
+@pytest.mark.parametrize(("lost", "wanted"), [(0, 0), (2, 1)])
+def test_how_a_sweep_ended(capsys, monkeypatch, sweep_file, tmp_path, lost, wanted):
+    def ended(spec, job, *_):
+        done = SweepResult(
+            n_cases=6,
             n_run=3,
             compile_time=1.5,
             run_time=2.5,
-            is_interrupted=is_interrupted,
             executor="kernel",
             lost=np.arange(lost),
         )
+        return in_folder(done, job.place)
 
-    monkeypatch.setattr(sweep_run, "run_sweep", ended)
+    monkeypatch.setattr(sweep_run, "swept_into", ended)
     out = tmp_path / "out"
     code, text, err = run(capsys, "sweep", sweep_file, "--out", out)
     assert code == wanted
     assert (f"{lost} of 6 cases were left out" in err) == (lost > 0)
-    resume = (
-        f"{6 - lost} of 6 cases are safe; continue with: studies sweep {sweep_file} --out {out}"
-    )
-    assert (f"interrupted; {resume} --resume" in err) == is_interrupted
-    done = r"3 cases in 2\.5 s and 1\.5 s of compiling, \d+ s with all else; results: "
-    assert bool(re.search(done + re.escape(str(out / "results.h5")), text)) == (not is_interrupted)
+    done = f"3 cases in 2.5 s and 1.5 s of compiling; results: {out}/results.h5"
+    assert done in text.splitlines()
+
+
+def test_how_an_interrupted_sweep_ended(capsys, monkeypatch, sweep_file, tmp_path):
+    def ended(*_):
+        raise KeyboardInterrupt("4 of 6 cases are safe")
+
+    monkeypatch.setattr(sweep_run, "swept_into", ended)
+    out = tmp_path / "it's"
+    code, text, err = run(capsys, "sweep", sweep_file, "--out", out)
+    again = f"studies sweep {sweep_file} --out {shlex.quote(str(out))} --resume"
+    assert (code, text) == (130, "")
+    assert err == f"studies: 4 of 6 cases are safe; continue with: {again}\nstudies: interrupted\n"
+    with pytest.raises(KeyboardInterrupt):
+        studies.sweep(sweep_file, tmp_path / "new", progress=False)
+    assert "safe; continue with: " in capsys.readouterr().err
 
 
 # --- retries on a cluster -------------------------------------------------------------------------
@@ -124,11 +132,15 @@ class FakeCluster:
         self.submitted, self.flying, self.most, self.with_others = [], set(), 0, []
         self.jobs = []
 
-    def submit(self, function, job, **_):
-        self.jobs.append(job)
-        self.submitted.append(int(job.rows[0]))
+    def ncores(self):
+        return range(self.n_workers)
+
+    def submit(self, what, identity, precision, function, spec, group, has_own_ratio, **_):
+        assert (what, function) == (call, run_chunk)
+        self.jobs.append((group, has_own_ratio))
+        self.submitted.append(int(group.rows[0]))
         self.with_others.append(len(self.flying))
-        future = (len(self.submitted), int(job.rows[0]))
+        future = (len(self.submitted), int(group.rows[0]))
         self.flying.add(future)
         self.most = max(self.most, len(self.flying))
         return future
@@ -144,7 +156,7 @@ class FakeCluster:
         answer = given.pop(0) if given else None
         if answer is not None:
             return answer
-        return ChunkDone(f"judged {future[1]}", "kernel", 0.0, "tcp://worker")
+        return f"judged {future[1]}", "kernel", 0.0
 
 
 @pytest.fixture
@@ -165,8 +177,8 @@ def on_cluster(monkeypatch):
 
     def outcome(answers, **options):
         fake = FakeCluster(answers, **options)
-        monkeypatch.setattr(cluster_runner, "Watch", lambda *_: fake)
-        runner = ClusterRunner(spec, fake, 60.0)
+        monkeypatch.setattr(remote, "Watch", lambda *_: fake)
+        runner = ClusterRunner(spec, Remote(fake, 60.0, print))
         reporter = Reporter(Phases(SILENT, ("compile", "run"), True), "run", 20)
         found = list(runner.run(table, groups, reporter, threading.Event()))
         return fake, found
@@ -189,7 +201,7 @@ def test_every_chunk_comes_back_once(on_cluster):
 def test_a_job_asks_for_what_the_cases_of_its_own_group_need(on_cluster):
     """Of two groups, the second has ratios from runs without control, and delay margins."""
     fake, _ = on_cluster({})
-    asked = {int(job.rows[0]): (job.has_own_ratio, job.robustness) for job in fake.jobs}
+    asked = {int(group.rows[0]): (own, group.robustness) for group, own in fake.jobs}
     plain, more = (False, ()), (True, ("delay_margin",))
     assert asked == {0: plain, 4: plain, 8: more, 12: more, 16: more}
 
@@ -214,6 +226,43 @@ def test_where_all_fail_all_are_given_up(on_cluster):
     fake, found = on_cluster({k: ["x", "y"] for k in (0, 4, 8, 12, 16)}, workers=1)
     assert first_rows(found, Lost) == [0, 4, 8, 12, 16] and len(fake.submitted) == 10
     assert fake.most == AHEAD
+
+
+def evaluator_of(monkeypatch, *answers):
+    """Of four starts on three workers, which give these answers, the last part first."""
+    monkeypatch.setattr(Evaluator, "__init__", lambda self, spec, families: None)
+
+    def answered(function, jobs):
+        assert function is evaluate_part
+        parts.extend(jobs)
+        return reversed([(k, answer) for (k, _), answer in zip(jobs, answers, strict=True)])
+
+    parts = []
+    spec = tuning({"control.gain_factor": {"from": 0.0, "to": 2.0}}, starts=4)
+    remote = SimpleNamespace(n_workers=3, say=lambda text: None, map=answered)
+    return ClusterEvaluator(spec, remote), parts
+
+
+def test_parts_of_a_tuning_come_back_in_their_order(monkeypatch):
+    evaluations = [Evaluation(*[np.full(n, float(k))] * 7) for k, n in enumerate((2, 1, 1))]
+    evaluator, parts = evaluator_of(monkeypatch, *evaluations)
+    found = evaluator.evaluate(np.arange(4.0)[:, None], np.array([True, False, True, True]))
+    assert all(np.array_equal(x, [0, 0, 1, 2]) for x in found)
+    sent = [
+        (families, values.tolist(), needed.tolist()) for _, (_, families, values, needed) in parts
+    ]
+    assert sent == [
+        ((0, 0), [[0.0], [1.0]], [True, False]),
+        ((0,), [[2.0]], [True]),
+        ((0,), [[3.0]], [True]),
+    ]
+
+
+def test_a_part_of_a_tuning_that_is_given_up_ends_it(monkeypatch):
+    evaluator, _ = evaluator_of(monkeypatch, None, "OSError: no room", None)
+    wanted = "a part of the designs cannot be evaluated: OSError: no room; .* with --resume"
+    with pytest.raises(StudyError, match=wanted):
+        evaluator.evaluate(np.zeros((4, 1)))
 
 
 # --- audits ---------------------------------------------------------------------------------------
@@ -281,50 +330,63 @@ def test_an_audit_finds_a_falsified_derivative(monkeypatch, error):
 # --- single runs and certificates -----------------------------------------------------------------
 
 
+@pytest.fixture
+def simulated(capsys, monkeypatch):
+    """Exit code and text of a run that ended so, of a case for which a sweep has these numbers."""
+    monkeypatch.setattr(Simulation, "report", lambda found: found.notes)
+    monkeypatch.setattr(
+        "studies.show.report.print_report", lambda notes, console: console.print(*notes, sep="\n")
+    )
+
+    def ended(code, stored=None, found=None):
+        for name, value in (
+            ("as_design", SimpleNamespace(study=None, stored=stored or {})),
+            ("run_study", SimpleNamespace(status=code)),
+            ("deviations", found),
+        ):
+            monkeypatch.setattr(single_run, name, lambda *_, value=value, **__: value)
+        return run(capsys, "simulate", "folder", "--case", "1")[:2]
+
+    return ended
+
+
 @pytest.mark.parametrize(("ended", "wanted"), [(status.OK, 0), (status.DIVERGED, 1)])
-def test_a_run_that_is_not_ok_fails(capsys, monkeypatch, ended, wanted):
-    made = SimpleNamespace(status=ended)
-    monkeypatch.setattr(single_run, "simulate", lambda *_: made)
-    monkeypatch.setattr("studies.engine.runs.uncontrolled_twin", lambda run: None)
-    monkeypatch.setattr("studies.single.say.say", lambda *_: None)
-    monkeypatch.setattr("studies.show.report.print_report", lambda *_: None)
-    assert run(capsys, "simulate", "paper")[0] == wanted
+def test_a_run_that_is_not_ok_fails(simulated, ended, wanted):
+    assert simulated(ended) == (wanted, "\n")
 
 
-@pytest.mark.parametrize(("stored", "wanted"), [(status.OK, 0), (status.SATURATED, 1), (None, 0)])
-def test_a_replay_that_ends_otherwise_fails(capsys, monkeypatch, stored, wanted):
-    again = SimpleNamespace(study=SimpleNamespace(title="this"), status=status.OK)
-    kept = SimpleNamespace(study=None, stored={} if stored is None else {"status": stored})
-    monkeypatch.setattr(single_run, "load_design", lambda *_: kept)
-    monkeypatch.setattr(single_run, "run_study", lambda _: again)
+@pytest.mark.parametrize(("stored", "wanted"), [(status.OK, 0), (status.SATURATED, 1)])
+def test_a_case_that_ends_otherwise_fails(simulated, stored, wanted):
     found = {"residual_rms": (1e-7, 1e-6)}
-    monkeypatch.setattr(single_run, "deviations", lambda *_: found)
-    code, text, _ = run(capsys, "replay", "folder", "--case", "1")
-    assert code == wanted and "this: ok" in text
+    code, text = simulated(status.OK, {"status": stored}, found)
+    assert code == wanted
     assert ("CAUTION: the sweep and this run end differently." in text) == bool(wanted)
-    told = "largest relative difference of a metric: 1.0e-07 (residual_rms)"
-    assert (told in text) == (stored is not None)
+    assert "largest relative difference of a metric: 1.0e-07 (residual_rms)" in text
     found["gain_margin"] = (0.5, 0.02)
-    code, text, _ = run(capsys, "replay", "folder", "--case", "1")
-    told = "CAUTION: gain_margin differs by 50 %; allowed: 2 %."
-    assert (code == 1 and told in text) == (stored is not None)
+    code, text = simulated(status.OK, {"status": stored}, found)
+    assert code == 1 and "CAUTION: gain_margin differs by 50 %; allowed: 2 %." in text
+
+
+def test_a_case_that_failed_in_its_sweep_as_well_is_no_failure(simulated):
+    code, text = simulated(status.DIVERGED, {"status": status.DIVERGED}, {})
+    assert code == 0 and "CAUTION" not in text
 
 
 @pytest.mark.parametrize("is_kept", [False, True])
-def test_a_replay_sees_strain_that_its_sweep_did_not_keep(capsys, monkeypatch, is_kept):
-    again = SimpleNamespace(study=SimpleNamespace(title="this"), status=status.STRAINED)
-    kept = SimpleNamespace(study=None, stored={"status": status.OK})
+def test_a_run_sees_strain_that_its_sweep_did_not_keep(simulated, is_kept):
     found = {"patch_strain_peak": (0.0, 1e-6)} if is_kept else {}
-    for name, value in (("load_design", kept), ("run_study", again), ("deviations", found)):
-        monkeypatch.setattr(single_run, name, lambda *_, value=value: value)
-    code, text, _ = run(capsys, "replay", "folder", "--case", "1")
-    assert code == is_kept and "this: patches strained beyond patches.strain_limit" in text
+    assert simulated(status.STRAINED, {"status": status.OK}, found)[0] == is_kept
 
 
-@pytest.mark.parametrize("is_passed", [True, False])
-def test_a_certificate_that_is_not_passed_fails(capsys, monkeypatch, is_passed, tmp_path):
-    monkeypatch.setattr(
-        spillover_run, "spillover_design", lambda *_: SimpleNamespace(is_passed=is_passed)
-    )
-    code, _, err = run(capsys, "spillover", "paper", "--out", tmp_path / "out")
-    assert (code, err) == (0 if is_passed else 1, "")
+@pytest.mark.parametrize("is_good", [True, False])
+def test_a_certificate_that_is_not_passed_fails(capsys, monkeypatch, is_good, tmp_path):
+    class Made(Result):
+        folder, is_good = tmp_path, None
+
+        def lines(self):
+            return ["verdict"]
+
+    Made.is_good = is_good
+    monkeypatch.setattr(spillover_run, "certified", lambda *_: Made())
+    code, text, err = run(capsys, "certify", "paper", "--out", tmp_path / "out")
+    assert (code, err) == (0 if is_good else 1, "") and "verdict" in text

@@ -8,14 +8,14 @@ import tempfile
 
 import pytest
 
-from studies.engine.folder import BASELINE, LOCK, locked_folder
+from studies.engine.folder import BASELINE
 from studies.errors import StudyError
+from studies.job import LOCK, locked_folder
 from studies.publish import working_folder
 from studies.store import write_store
 from studies.sweeps import run as sweeps
-from studies.sweeps.run import run_sweep
 from tests.studies.test_exit_codes import Losing
-from tests.sweeps import small_spec
+from tests.sweeps import run_sweep, small_spec
 
 
 @pytest.mark.parametrize("code", [errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS])
@@ -30,7 +30,7 @@ def test_a_file_system_without_locks_is_refused_in_words(tmp_path, monkeypatch, 
 
 
 def test_a_folder_in_use_is_another_matter(tmp_path):
-    refused = pytest.raises(StudyError, match="another process is running a sweep there")
+    refused = pytest.raises(StudyError, match="another process is at work on a sweep there")
     with locked_folder(tmp_path, "sweep"), refused, locked_folder(tmp_path, "sweep"):
         pass
     assert (tmp_path / LOCK).exists()
@@ -47,7 +47,7 @@ def test_a_folder_removed_in_mid_run_ends_in_a_message(tmp_path, monkeypatch):
     monkeypatch.setattr(sweeps, "keep_baseline", remove)
     spec = small_spec({"axes": {"gain": [0.1, 0.5]}})
     with pytest.raises(StudyError, match="out: was renamed or removed while work went on in it"):
-        run_sweep(spec, out, is_quiet=True, runner=Losing())
+        run_sweep(spec, out, runner=Losing())
     assert not out.exists()
 
 

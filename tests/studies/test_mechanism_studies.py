@@ -17,9 +17,11 @@ from studies.atlas import drawing
 from studies.cli import main
 from studies.engine.preflight import check_run
 from studies.extensions import VARIABLE, extend
+from studies.space.spec import parse_sweep
 from studies.study.cases import build_structure, case_of
 from studies.study.numbers import one_study
 from studies.study.spec import Study
+from studies.sweeps.run import make_plan
 from studies.verify.machine import check_machine
 from tests import TOP
 from tests.bare import parse_study
@@ -81,7 +83,7 @@ link_subsets = "all"
 
 
 def test_a_sweep_judges_and_damps(kind, tmp_path):
-    data = studies.load(swept(tmp_path, kind))
+    data = studies.load(swept(tmp_path, kind)).data
     rms, margin = (np.asarray(data[x]) for x in ("residual_rms", "gain_margin"))
     assert rms.shape == (2, 4, 2, 2, 3) and np.all(np.asarray(data["status"]) == 0)
     assert np.isfinite(margin).all() and margin.min() > 1.5
@@ -95,7 +97,7 @@ def test_a_case_is_drawn_and_run_again_with_its_report(kind, tmp_path, capsys):
     main(["explore", folder])
     assert (tmp_path / "sweep" / "explorer.html").stat().st_size > 1e4
     out = str(tmp_path / "run.h5")
-    main(["replay", folder, "--case", "13", "--out", out, "--report"])
+    main(["simulate", folder, "--case", "13", "--out", out, "--report"])
     assert (tmp_path / "run.html").stat().st_size > 1e4
     said = capsys.readouterr().out.partition("largest relative difference of a metric: ")[2]
     assert float(said.split()[0]) < 1e-6
@@ -122,13 +124,13 @@ residual_rms = 1.0
 """
     main(["tune", written(tmp_path, "five_bar", more), "--out", str(tmp_path / "tune")])
     before = Study().change(machine__kind="five_bar").control.velocity_gain
-    tuned = studies.load_study(tmp_path / "tune" / "tuned.toml")
+    tuned = studies.load(tmp_path / "tune" / "tuned.toml")
     assert len(tuned.control.velocity_gain) == 2 and tuned.control.velocity_gain != before
 
 
 @pytest.mark.long
 def test_a_five_bar_is_certified(tmp_path, capsys):
-    main(["spillover", written(tmp_path, "five_bar"), "--out", str(tmp_path / "certificate")])
+    main(["certify", written(tmp_path, "five_bar"), "--out", str(tmp_path / "certificate")])
     assert (tmp_path / "certificate" / "report.html").stat().st_size > 1e4
 
 
@@ -155,7 +157,7 @@ def test_a_pose_has_as_many_numbers_as_the_platform(capsys):
 
 def test_modes_of_two_links_are_named(gantry):
     study = parse_study(tomllib.loads(SHORT.format(kind=gantry, y=0.14, end=0.15)))
-    modes = studies.machine_modes(study)
+    modes = studies.modes(study)
     assert modes.link_share.shape[1:] == (2, 2)
     assert np.all(np.isfinite(modes.frequency)) and len(modes.frequency) == 6
     bending = modes.shape[:, 2].real
@@ -255,5 +257,5 @@ def test_gradients_by_crank_and_gain_are_those_of_differences(kind):
 )
 def test_axes_that_no_machine_can_have_are_refused(axes, message):
     with pytest.raises(studies.StudyError, match=message):
-        spec = studies.parse_sweep({"machine": {"kind": "rrr"}, "sweep": {"axes": axes}})
-        studies.make_plan(spec)
+        spec = parse_sweep({"machine": {"kind": "rrr"}, "sweep": {"axes": axes}})
+        make_plan(spec)

@@ -7,8 +7,8 @@ import sys
 import jax
 import pytest
 
-from studies import run_study
 from studies.engine.controller import fixed_controller
+from studies.engine.runs import run_study
 from tests.canonical import TINY, study_of
 
 UNPICKLE = """

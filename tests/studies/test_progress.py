@@ -12,7 +12,8 @@ from rich.console import Console
 
 from studies import config
 from studies.engine import progress
-from studies.engine.progress import Phases, Reporter, duration_text
+from studies.engine.progress import Reporter
+from studies.phases import Phases, duration_text
 from tests.canonical import TINY, text_of
 
 NAMES = ("compile", "run", "join", "draw")
@@ -56,6 +57,24 @@ def test_the_time_left_says_which_phases_it_does_not_cover():
     lines = shown(steps).splitlines()
     assert lines[1:3] == ["1/2; about 5 s left in this phase, then join, draw", "2/2"]
     assert lines[4:] == ["1/2; about 5 s left", "2/2"]
+
+
+def test_the_time_left_is_what_is_typical_times_what_this_machine_needed(clock):
+    said, typical = (
+        Console(file=io.StringIO(), width=200),
+        {"run": 100.0, "join": 40.0, "draw": 10.0},
+    )
+    with Phases(said, typical) as phases:
+        phases.begin("run")
+        clock[0] = 50.0
+        phases.begin("join", "files")
+        clock[0] = 280.0
+        phases.begin("draw")
+    assert said.file.getvalue().splitlines() == [
+        "run (1 of 3), 0 s since the start: about 2 min left",
+        "join (2 of 3), 50 s since the start: files; about 25 s left",
+        "draw (3 of 3), 5 min since the start: about 20 s left",
+    ]
 
 
 def test_a_terminal_has_one_line_for_all_phases():

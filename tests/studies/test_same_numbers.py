@@ -31,7 +31,7 @@ if variation == "narrow vectors":
     narrow = native.this_processor().without("avx512")
     native.this_processor = lambda: narrow
 from studies.engine.results import read_sweep
-from studies.sweeps.run import run_sweep
+from tests.sweeps import run_sweep
 spec = parse_sweep({
     "run": {"duration": 0.025, "seed": 3},
     "link": {"modes": 3},
@@ -44,7 +44,7 @@ spec = parse_sweep({
         "blocks": [{"method": "sobol", "count": 8, "axes": {"placement": {"kind": "per_link"}}}],
     },
 })
-done = run_sweep(spec, out, is_quiet=True)
+done = run_sweep(spec, out)
 assert ("scan" in done.executor) == (variation == "scan"), done.executor
 data = read_sweep(out)
 arrays = {name: x.data for name, x in data.variables.items() if x.dims[:1] == ("case",)}

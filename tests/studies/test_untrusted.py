@@ -20,17 +20,16 @@ from campaigns.mutations import KINDS, Hang, attack, originals
 from studies.cli import main
 from studies.engine.folder import (
     BASELINE,
-    LOCK,
     MANIFEST,
     RESULTS,
     file_hash,
     finished_cases,
-    locked_folder,
     read_manifest,
 )
 from studies.engine.results import read_sweep
 from studies.errors import StudyError
 from studies.export.document import read_document
+from studies.job import LOCK, locked_folder
 from studies.reading import DEEPEST, LARGEST, open_hdf5, read_bytes, read_json, read_npz
 from studies.study.spec import load_study
 
@@ -232,7 +231,6 @@ def sweep(tmp_path_factory):
     [
         ({"results": 7}, "damaged (results is not a list)"),
         ({"given_up": {}}, "damaged (given_up is not a list)"),
-        ({"spec": {"sweep": {"screen": 3}}}, "damaged (sweep.screen is not a table)"),
         ({"spec": []}, "damaged (no sweep in it)"),
     ],
 )

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from studies.engine.batches import ProgressCallback
-from studies.papers.card import CardResult, PaperCard
+from studies.job import Job
+from studies.papers.card import CardResult, PaperCard, PaperOutcome
 from studies.papers.zhang_2016 import tables
-from studies.papers.zhang_2016.cases import PaperCase, fitted_study, paper_cases, run_cases, work_of
+from studies.papers.zhang_2016.cases import PaperCase, fitted_study, paper_cases, run_cases
 from studies.papers.zhang_2016.claims import CLAIMS, LEFT_OPEN, judge
 from studies.papers.zhang_2016.context import Context, Machines
 from studies.papers.zhang_2016.measures import measure
@@ -21,23 +21,21 @@ from studies.study.labels import describe
 from studies.study.spec import Study, paper_study
 
 
-def evaluate(
-    fitted: Study, nominal: Study, cases: list[PaperCase], on_progress: ProgressCallback
-) -> Machines:
+def evaluate(fitted: Study, nominal: Study, cases: list[PaperCase], job: Job) -> Machines:
     """Run the cases.
 
     Args:
         fitted: the machine of the measurements, which runs the compared cases.
         nominal: the machine that runs all cases.
         cases: from `paper_cases`.
-        on_progress: called with progress messages.
+        job: whose phase says what is done.
 
     Raises:
         StudyError: as `run_cases`.
     """
     compared = _compared(cases)
-    first = run_cases(fitted, compared, on_progress)
-    second = run_cases(nominal, cases, on_progress)
+    first = job.part("fitted machine", lambda: run_cases(fitted, compared, job.say))
+    second = job.part("nominal machine", lambda: run_cases(nominal, cases, job.say))
     return Machines(
         Context("fitted machine", first, measure(first)),
         Context("nominal machine", second, measure(second)),
@@ -49,9 +47,16 @@ def result_of(machines: Machines) -> CardResult:
     verdicts = judge(machines)
     return CardResult(
         study=machines.nominal.runs.study,
-        verdicts=verdicts,
+        outcome=PaperOutcome(
+            card=CARD.name,
+            title=CARD.title,
+            source=CARD.source,
+            read=CARD.read,
+            claims=verdicts,
+            left_open=CARD.left_open,
+        ),
         tables=_tables(machines),
-        report=say(CARD, verdicts, machines),
+        page=say(CARD, verdicts, machines),
         stores={
             name: (context.runs.study, paper_variables(context.runs, context.measures))
             for name, context in zip(Machines._fields, machines, strict=True)
@@ -83,8 +88,8 @@ def _tables(machines: Machines) -> dict[str, Rows]:
     }
 
 
-def _run(on_progress: ProgressCallback) -> CardResult:
-    return result_of(evaluate(fitted_study(), paper_study(), paper_cases(), on_progress))
+def _run(job: Job) -> CardResult:
+    return result_of(evaluate(fitted_study(), paper_study(), paper_cases(), job))
 
 
 CARD = PaperCard(
@@ -98,6 +103,5 @@ CARD = PaperCard(
     read="Read as a whole; numbers that stand in its figures only were not read off.",
     claims=CLAIMS,
     left_open=LEFT_OPEN,
-    work=work_of(_compared(paper_cases())) + work_of(paper_cases()),
     run=_run,
 )

@@ -9,6 +9,7 @@ trace than the scan takes for these few cases (docs/performance.md).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
@@ -20,8 +21,8 @@ import numpy as np
 from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
 from jaxmodel.loop import Record
-from jaxmodel.simulate import Result
-from studies.engine.batches import BATCH, ProgressCallback, run_batches
+from jaxmodel.simulate import RunResult
+from studies.engine.batches import run_batches
 from studies.engine.frame import SharedFrame, frame_of
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
@@ -113,7 +114,7 @@ class PaperRuns(NamedTuple):
     study: Study
     frame: SharedFrame
     cases: list[PaperCase]
-    result: Result
+    result: RunResult
     status: np.ndarray  # codes; UNSTABLE if the linearised sampled loop is, (n,)
     ratio: np.ndarray  # gains of the modes over that of mode 1 [1], (n, 3, C)
     loops: dict[str, LoopFigures]  # by case name, if the loop was linearised
@@ -204,13 +205,13 @@ def build_paper_case(
     return structure, arrays._replace(control=arrays.control._replace(n_active=count))
 
 
-def run_cases(base: Study, cases: list[PaperCase], on_progress: ProgressCallback) -> PaperRuns:
+def run_cases(base: Study, cases: list[PaperCase], say: Callable[[str], object]) -> PaperRuns:
     """Run the paper's cases.
 
     Args:
         base: the machine; move, shaper and control come from the cases.
         cases: including the uncontrolled counterparts of all controlled ones.
-        on_progress: called with progress messages.
+        say: called with what is done next.
 
     Returns:
         PaperRuns, cases in the order: uncontrolled, controlled, ideal feedback.
@@ -218,25 +219,23 @@ def run_cases(base: Study, cases: list[PaperCase], on_progress: ProgressCallback
     Raises:
         StudyError: as `check_run`.
     """
-    on_progress("checking the cases", 0.0)
+    say("checking the cases")
     off = [case for case in cases if not case.is_controlled]
     on = [case for case in cases if case.is_controlled and case.feedback == "sampled"]
     ideal = [case for case in cases if case.feedback == "ideal"]
     # a program of its own, compiled on the second core while the first one runs the batches
     with ThreadPoolExecutor(1) as side:
-        ideal_runs = [side.submit(_run_ideal, base, case, on_progress) for case in ideal]
+        ideal_runs = [side.submit(_run_ideal, base, case, say) for case in ideal]
         built = [build_paper_case(base, case) for case in off]
         structure = built[0][0]
         frame = frame_of(structure, built[0][1])
-        results = [run_batches(structure, [arrays for _, arrays in built], on_progress)]
+        results = [run_batches(structure, [arrays for _, arrays in built], say)]
         energy_ratio = results[0].metrics.energy_ratio
         by_counterpart = {case.counterpart: energy_ratio[k] for k, case in enumerate(off)}
         ratios = [_ratio(case, by_counterpart) for case in on]
         arrays = [build_paper_case(base, case, r)[1] for case, r in zip(on, ratios, strict=True)]
-        results += [run_batches(structure, arrays, on_progress)] if arrays else []
-        loops = _judge(
-            structure, {c.name: a for c, a in zip(on, arrays, strict=True)}, base, on_progress
-        )
+        results += [run_batches(structure, arrays, say)] if arrays else []
+        loops = _judge(structure, {c.name: a for c, a in zip(on, arrays, strict=True)}, base, say)
         results += [run.result() for run in ideal_runs]
     result = jax.tree.map(lambda *x: np.concatenate(x), *results)
     ordered = off + on + ideal
@@ -263,11 +262,10 @@ def link_hz(structure: Structure, case: Case) -> Any:
     return find_bases(structure, case).plant_omega / (2 * jnp.pi)
 
 
-def _run_ideal(base: Study, case: PaperCase, on_progress: ProgressCallback) -> Result:
+def _run_ideal(base: Study, case: PaperCase, say: Callable[[str], object]) -> RunResult:
     """A case with ideal feedback, as a batch of one."""
-    on_progress("simulating ideal feedback", 0.0)
+    say("simulating ideal feedback")
     result = run_study(case_study(base, case), has_loop=False).result
-    on_progress("simulated ideal feedback", 1.0)
     return jax.tree.map(lambda x: np.asarray(x)[None], result)
 
 
@@ -278,20 +276,11 @@ def _ratio(case: PaperCase, by_counterpart: dict[tuple[Any, ...], np.ndarray]) -
 
 
 def _judge(
-    structure: Structure, arrays: dict[str, Case], base: Study, on_progress: ProgressCallback
+    structure: Structure, arrays: dict[str, Case], base: Study, say: Callable[[str], object]
 ) -> dict[str, LoopFigures]:
     """Linearised sampled loops of the JUDGED cases at home."""
     loops = {}
     for name in [name for name in JUDGED if name in arrays]:
-        on_progress("judging the linearised sampled loop", 0.0)
+        say("judging the linearised sampled loop")
         loops[name] = loop_report(structure, arrays[name], np.array(base.motion.waypoints[0]))
-        on_progress("judged the linearised sampled loop", 1.0)
     return loops
-
-
-def work_of(cases: list[PaperCase]) -> int:
-    """Number of steps that `run_cases` reports for these cases."""
-    off = [case for case in cases if not case.is_controlled]
-    ideal = sum(case.feedback == "ideal" for case in cases)
-    batches = -(-len(off) // BATCH) - (-(len(cases) - len(off) - ideal) // BATCH)
-    return batches + ideal + sum(case.name in JUDGED for case in cases)

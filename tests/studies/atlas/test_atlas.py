@@ -1,7 +1,6 @@
 """The atlas: shares against their definition, modes and responses against the machine's own."""
 
 import dataclasses
-import io
 from functools import partial
 from itertools import permutations
 from pathlib import Path
@@ -12,7 +11,6 @@ import pytest
 import xarray
 from matplotlib.figure import Figure
 from PIL import Image
-from rich.console import Console
 
 from studies.atlas import (
     attribution,
@@ -28,11 +26,13 @@ from studies.atlas import (
 )
 from studies.atlas.platform import LINK_SETS, platform_error, responses
 from studies.atlas.say import _errors
+from studies.atlas.verb import atlas as atlas_of
 from studies.engine.modes import machine_modes
 from studies.engine.results import read_sweep
 from studies.engine.runs import run_study
 from studies.errors import StudyError
 from tests.canonical import HOME, MACHINE, TINY, study_of
+from tests.jobs import quiet_job
 from tests.pages import Page, text_of
 from tests.studies.test_cli import refused
 from tests.studies.test_cli import run as command
@@ -80,7 +80,6 @@ def atlas(tmp_path_factory):
         return kept["found"]
 
     # what is replaced is part of no program: they are kept
-    console = Console(file=io.StringIO())
     with (
         narrow_blocks(32),
         mock.patch.multiple(
@@ -98,7 +97,7 @@ def atlas(tmp_path_factory):
             FREQUENCY=np.array([1.0, 50.0, 114.0, 300.0]),
         ),
     ):
-        assert run.run_atlas(small_study(), folder, False, console)
+        assert atlas_of(small_study(), folder, progress=False).folder == folder
     return folder, kept["found"]
 
 
@@ -365,7 +364,7 @@ def test_a_report_says_what_control_of_all_links_changes():
 )
 def test_designs_without_subsets_are_refused(tmp_path, fields, message):
     with pytest.raises(StudyError, match=message):
-        run.run_atlas(small_study(**fields), tmp_path / "out", False, Console(file=io.StringIO()))
+        atlas_of(small_study(**fields), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -391,15 +390,27 @@ def test_atlas_leaves_a_folder_of_something_else_alone(tmp_path):
     mine = tmp_path / "report.html"
     mine.write_text("mine")
     with pytest.raises(StudyError, match="holds other files"):
-        run.run_atlas(small_study(), tmp_path, False, Console(file=io.StringIO()))
+        atlas_of(small_study(), tmp_path)
     assert mine.read_text() == "mine"
+
+
+def test_a_resumed_analysis_repeats_nothing(atlas):
+    folder, found = atlas
+    nothing = dict.fromkeys(("platform_error", "responses", "map_workspace"))
+    with mock.patch.multiple(findings, **nothing):
+        again = findings.evaluate_atlas(
+            found.study, found.choices, found.subsets, list(found.dropped), quiet_job(folder)
+        )
+    data, wanted = run.atlas_variables(again), run.atlas_variables(found)
+    for name, variable in wanted.items():
+        np.testing.assert_array_equal(data[name].data, variable.data, err_msg=name)
 
 
 def test_atlas_goes_on_after_an_interrupt_and_refuses_to_start_over(atlas, tmp_path):
     folder = atlas[0]
     assert read_sweep(folder / run.RUNS_FOLDER).is_finished.all()
     with pytest.raises(StudyError, match="add --resume"):
-        run.run_atlas(small_study(), folder, False, Console(file=io.StringIO()))
+        atlas_of(small_study(), folder)
     assert Path(folder / "report.html").is_file()
 
 
@@ -408,6 +419,6 @@ def test_an_interrupted_drawing_says_how_to_go_on(tmp_path, monkeypatch, capsys)
     def stop(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run, "_run", stop)
+    monkeypatch.setattr(run, "mapped", stop)
     code, _, err = command(capsys, "atlas", "--out", tmp_path / "out")
-    assert code == 130 and f"continue with --resume --out {tmp_path / 'out'}" in err
+    assert code == 130 and f"continue with: studies atlas --out {tmp_path / 'out'} --resume" in err

@@ -11,6 +11,7 @@ from jaxmodel.changes import MachineChange, changed_case
 from jaxmodel.linear import linearise, resting
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import analogue_plant, closed_loop
+from studies.commands import settings
 from studies.documents import schema
 from studies.engine import breaking
 from studies.engine.breaking import TOLERANCES, parse_tolerances, smallest_change
@@ -304,14 +305,14 @@ def test_an_unstable_design_needs_no_change():
 
 
 def test_tolerances_are_numbers_by_name():
-    found = parse_tolerances(["patch=2e-3", "delay = 0"])
+    found = parse_tolerances(settings("--tolerance", ["patch=2e-3", "delay = 0"]))
     assert found == TOLERANCES._replace(patch=2e-3, delay=0.0)
     with pytest.raises(StudyError, match="--tolerance = 'pach'.*did you mean 'patch'"):
-        parse_tolerances(["pach=1"])
+        parse_tolerances({"pach": 1.0})
     with pytest.raises(StudyError, match="--tolerance payload = '-1'; allowed: .* from 0 .kg."):
-        parse_tolerances(["payload=-1"])
+        parse_tolerances({"payload": "-1"})
     with pytest.raises(StudyError, match="at least one number"):
-        parse_tolerances([f"{name}=0" for name in MachineChange._fields])
+        parse_tolerances(dict.fromkeys(MachineChange._fields, 0.0))
 
 
 @pytest.mark.parametrize("kind", MachineChange._fields)
@@ -332,7 +333,7 @@ def test_patches_stay_on_their_links_and_apart():
 
 
 def test_the_record_is_that_of_its_schema(found):
-    whole = schema("spillover")["properties"]["smallest_change"]
+    whole = schema("certify")["properties"]["smallest_change"]
     jsonschema.validate(plain(found), whole)
 
 

@@ -28,7 +28,7 @@ def folders(tmp_path_factory):
 
 
 def test_axes_of_a_grid_are_dimensions(folders):
-    data, flat = studies.load(folders[0]), read_sweep(folders[0])
+    data, flat = studies.load(folders[0]).data, read_sweep(folders[0])
     assert data.residual_rms.dims == (GAIN, MODES, "link", "station")
     assert data[GAIN].values.tolist() == [0.1, 0.5, 1.0] and data[MODES].values.tolist() == [1, 2]
     for gain, modes, case in zip(flat[GAIN], flat[MODES], flat["case"], strict=True):
@@ -39,7 +39,7 @@ def test_axes_of_a_grid_are_dimensions(folders):
 
 
 def test_links_and_modes_count_from_one_and_carry_units(folders):
-    data = studies.load(folders[0])
+    data = studies.load(folders[0]).data
     for name in ("link", "mode", "controlled_mode"):
         assert data[name].values.tolist() == [1, 2, 3]
     assert data.residual_rms.attrs["units"] == "m" and data.residual_rms.attrs["long_name"]
@@ -50,13 +50,13 @@ def test_links_and_modes_count_from_one_and_carry_units(folders):
 
 
 def test_a_table_has_a_row_per_case_and_a_column_per_name(folders):
-    frame, data = studies.table(folders[0]), read_sweep(folders[0])
+    frame, data = studies.load(folders[0]).table(), read_sweep(folders[0])
     assert frame.index.tolist() == list(range(6)) and frame.index.name == "case"
     assert set(METRICS) | {"case_id", GAIN, MODES, "status", "gain_margin"} <= set(frame.columns)
     np.testing.assert_array_equal(frame.residual_rms, metric_values(data, "residual_rms"))
     assert frame.loc[3, "gain_margin"] == data["gain_margin"][3]
     assert frame[[GAIN, MODES]].to_numpy().tolist()[3] == [0.5, 2]
-    part = studies.table(folders[1])
+    part = studies.load(folders[1]).table()
     assert part.status.value_counts().to_dict() == {"ok": 4, "not run yet": 2}
     assert part.residual_rms.isna().sum() == 2
 
@@ -72,7 +72,7 @@ def test_a_table_has_a_column_per_entry_of_a_placement():
 
 
 def test_an_unfinished_sweep_says_so_in_words(folders):
-    data = studies.load(folders[1])
+    data = studies.load(folders[1]).data
     words = data.status_text.values.ravel().tolist()
     assert words == ["ok"] * 4 + ["not run"] * 2
     assert data.status.values.ravel().tolist() == [status.OK] * 4 + [-1] * 2
@@ -80,10 +80,10 @@ def test_an_unfinished_sweep_says_so_in_words(folders):
 
 
 def test_statuses_are_words():
-    codes = [0, status.UNSTABLE, -1, -2, 0, 99, 0, 0]
+    codes = [0, status.UNSTABLE, -1, 0, 99, 0, 0, 0]
     words = as_dataset(usual(codes=codes)).status_text.values.tolist()
     unstable = status.REASONS[status.UNSTABLE]
-    assert words[:6] == ["ok", unstable, "not run", "left out by the screen", "ok", "status 99"]
+    assert words[:5] == ["ok", unstable, "not run", "ok", "status 99"]
 
 
 def test_plain_xarray_opens_the_file_of_a_sweep(folders):
@@ -93,7 +93,7 @@ def test_plain_xarray_opens_the_file_of_a_sweep(folders):
         assert chosen[MODES].values.tolist() == [1, 2]
         margins = read_sweep(folders[0])["gain_margin"]
         np.testing.assert_array_equal(chosen.gain_margin.values, margins[2:4])
-        assert "left_out_by_the_screen" in data.status.attrs["flag_meanings"].split()
+        assert "not_run" in data.status.attrs["flag_meanings"].split()
         assert len(data[["gain_margin", "status"]].to_dataframe()) == 6
 
 
@@ -151,12 +151,13 @@ def test_best_cases_are_a_table():
     assert frame.case_id.tolist() == data["case_id"][[3, 1]].tolist()
 
 
-def test_functions_of_sweeps_take_their_folder(folders):
-    frame = studies.best_cases(folders[0], "residual_rms", count=3)
+def test_what_a_folder_holds_has_tables_and_figures(folders):
+    done = studies.load(folders[0])
+    frame = done.best("residual_rms", count=3)
     values = read_sweep(folders[0])["residual_rms"].reshape(6, -1).max(axis=1)
     assert frame.index.tolist() == np.argsort(values)[:3].tolist()
-    assert set(studies.table(str(folders[0])).status) == {"ok"}
-    assert studies.plot(folders[0], x="gain", y="residual_rms").axes
+    assert set(done.table().status) == {"ok"}
+    assert done.plot("residual_rms", x="gain").axes
 
 
 def test_commands_do_without_xarray_and_pandas(folders):

@@ -32,13 +32,12 @@ from studies.engine.results import read_sweep
 from studies.engine.stability import loop_report, with_margin_modes
 from studies.space.table import build_table
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure
-from studies.sweeps.run import run_sweep
 from studies.sweeps.show import ranked_cases
 from tests.bare import parse_sweep
 from tests.canonical import MACHINE, study_of
 from tests.jaxmodel.test_notch import NOTCHES
 from tests.loops import Loops, exact_margins, matrices, random_loops
-from tests.sweeps import FAST_MOVE
+from tests.sweeps import FAST_MOVE, run_sweep
 
 STUDY = study_of(MACHINE)
 HOME = np.array(STUDY.motion.waypoints[0])
@@ -509,7 +508,7 @@ placement = { kind = "same" }
 def test_cases_that_are_ok_have_stable_loops(tmp_path):
     """200 of them by eigenvalues, and 50 of those called unstable; none was saturated instead."""
     spec = parse_sweep(tomllib.loads(TWO_LINKS))
-    run_sweep(spec, tmp_path / "sweep", is_quiet=True)
+    run_sweep(spec, tmp_path / "sweep")
     data, table = read_sweep(tmp_path / "sweep"), build_table(spec)
     rng = np.random.default_rng(0)
     group = plan_groups(table, np.arange(len(table)), local_layout)[0]

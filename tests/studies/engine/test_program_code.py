@@ -12,11 +12,11 @@ from studies.engine import programs
 from studies.engine.preflight import preflight
 from studies.engine.runs import run_study
 from studies.study.cases import build_case, build_structure
-from studies.sweeps.run import run_sweep
 from studies.tuning.loop_figures import loop_figures
 from tests import TOP
 from tests.bare import parse_sweep, parse_tuning
 from tests.canonical import TINY, study_of
+from tests.sweeps import run_sweep
 
 PACKAGES = tuple(str(TOP / package) + "/" for package in sources.PACKAGES)
 

@@ -19,28 +19,23 @@ from studies.engine import folder as folders
 from studies.engine.folder import (
     BASELINE,
     CHUNKS,
-    CONTENT,
-    LOCK,
     RESULTS,
     finished_cases,
-    locked_folder,
-    make_manifest,
-    open_folder,
 )
 from studies.engine.results import DIGEST, baseline_digest, baseline_id, read_sweep
 from studies.errors import StudyError
+from studies.job import LOCK, locked_folder, working
 from studies.publish import publish, replacing
 from studies.results.labelled import Variable
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table
 from studies.store import write_store
 from studies.sweeps import run as run_module
-from studies.sweeps.run import case_content, make_plan, run_sweep
-from studies.tuning.folder import open_tuning
+from studies.sweeps.run import make_plan
 from tests import TOP
 from tests.bare import bare
 from tests.canonical import TINY
-from tests.sweeps import narrow_blocks
+from tests.sweeps import narrow_blocks, run_sweep
 
 GAINS = [round(0.05 * k, 2) for k in range(2, 26)]
 SWEEP = {"axes": {"gain": GAINS}, "metrics": ["residual_rms", "peak_voltage"]}
@@ -58,7 +53,7 @@ def request(**changes):
 
 
 def run(data, out, **options):
-    return run_sweep(parse_sweep(data), Path(out), is_quiet=True, **options)
+    return run_sweep(parse_sweep(data), out, **options)
 
 
 @pytest.fixture(scope="module")
@@ -110,33 +105,10 @@ def test_what_finished_cases_do_not_hold_is_refused(changes, tmp_path):
         spec = parse_sweep(data | {"sweep": data["sweep"] | changes})
         refused = partial(pytest.raises, StudyError, match=r"sweep\.\w+ = .* keeps the same")
         with refused():
-            run_sweep(spec, folder, is_resumed=True, is_quiet=True)
+            run_sweep(spec, folder, resume=True)
         with refused():
             make_plan(spec, folder)
         assert contents(folder) == before
-
-
-def test_a_screen_keeps_what_its_values_are_taken_over(tmp_path):
-    """A link more that some new case controls changes the values of old ones."""
-
-    def screened(subsets, **screen):
-        return request(screen=screen, axes={"link_subsets": subsets, "gain": GAINS})
-
-    spec = parse_sweep(screened(["1"]))
-    content = case_content(spec, build_table(spec))
-    manifest = make_manifest(spec.data) | {CONTENT: content}
-    with open_folder(tmp_path / "s", manifest, False) as folder:
-        folder.begin(manifest)
-    before = contents(tmp_path / "s")
-    for data, name in (
-        (screened(["1", "1+2"]), "links"),
-        (screened(["1"], by="peak_voltage"), "by"),
-    ):
-        with pytest.raises(StudyError, match=rf"sweep\.screen\.{name} = .* keeps the same"):
-            run(data, tmp_path / "s", is_resumed=True)
-    assert contents(tmp_path / "s") == before
-    wider = parse_sweep(screened(["1"], keep=0.4, subject_to="gain_margin > 0"))
-    assert case_content(wider, build_table(wider)) == content
 
 
 def test_an_extension_by_sampled_feedback_learns_the_step_of_its_adc(tmp_path):
@@ -162,7 +134,7 @@ OTHERS = {
     "repeats": [2],
     "seed": [1],
     "where": ["gain > 0.3", "gain > 0", "gain < 2"],
-    "screen": [{}, {"keep": 0.5}, {"by": "peak_voltage"}],
+    "subject_to": ["gain_margin > 2", "gain > 0.3"],
     "method": ["zip", "random"],
     "axes": [
         {"gain": [*GAINS, 1.3]},
@@ -216,15 +188,12 @@ def changed_at_random():
         return what, data
 
 
-def equal(a, b, is_screened):
-    """Whether a resumed sweep holds what a new one does; a screen may have run more cases."""
+def equal(a, b):
+    """Whether a resumed sweep holds what a new one does."""
     if a.variables.keys() != b.variables.keys() or a.baseline.keys() != b.baseline.keys():
         return False
-    is_run = b["status"] >= 0 if is_screened else np.ones(b.n_cases, bool)
     for name, variable in b.variables.items():
         mine, other = a[name], variable.data
-        if variable.dims[:1] == ("case",):
-            mine, other = mine[is_run], other[is_run]
         if other.dtype.kind != "f":
             if not np.array_equal(mine, other):
                 return False
@@ -242,15 +211,14 @@ def resume_at_random(seed, count, finished, begun, tmp_path):
         shutil.copytree(random.choice((finished, begun)), resumed)
         before = contents(resumed)
         try:
-            run(data, resumed, is_resumed=True)
+            run(data, resumed, resume=True)
         except StudyError as error:
             assert contents(resumed) == before, what
             print(f"{what}: {error}")
             refused += 1
         else:
             run(data, fresh)
-            is_screened = "screen" in data["sweep"]
-            assert equal(read_sweep(resumed), read_sweep(fresh), is_screened), what
+            assert equal(read_sweep(resumed), read_sweep(fresh)), what
             shutil.rmtree(fresh)
         shutil.rmtree(resumed)
     return refused
@@ -310,7 +278,7 @@ def test_a_sweep_whose_folder_was_renamed_leaves_the_new_one_alone(
     monkeypatch.undo()
     done = len(finished_cases(tmp_path / "renamed").case_id)
     assert done > 0
-    assert run(request(), tmp_path / "renamed", is_resumed=True).n_run == len(GAINS) - done
+    assert run(request(), tmp_path / "renamed", resume=True).n_run == len(GAINS) - done
     read_sweep(tmp_path / "renamed")
 
 
@@ -337,20 +305,19 @@ def write_progress(out):
         temporary.write_text("x")
 
 
+def tuning(out):
+    return working("tune", out, {}, ("descend",), progress=False)
+
+
 @pytest.mark.parametrize(
     "write", [write_report, write_progress, lambda out: write_store(out / "x.h5", {}, {})]
 )
-@pytest.mark.parametrize("opened", [locked_folder, open_tuning])
+@pytest.mark.parametrize("opened", [partial(locked_folder, verb="sweep"), tuning])
 @pytest.mark.parametrize("is_inside", [False, True])
 def test_whatever_is_written_into_a_reserved_folder(write, opened, is_inside, tmp_path):
     """Of any command; into a folder of a stage in it, too."""
     out = tmp_path / "s"
-    given = (
-        ("screen",)
-        if opened is locked_folder
-        else (dict.fromkeys(("spec", "code", "jaxlib", "precision"), ""), False)
-    )
-    with pytest.raises(StudyError, match=MOVED), opened(out, *given):
+    with pytest.raises(StudyError, match=MOVED), opened(out):
         (out / "stage").mkdir()
         write(out / "stage" if is_inside else out)
         out.rename(tmp_path / "renamed")
@@ -366,7 +333,7 @@ def test_what_takes_long_to_write_is_looked_at_again(tmp_path):
     out = tmp_path / "s"
     with (
         pytest.raises(StudyError, match=MOVED),
-        locked_folder(out, "screen"),
+        locked_folder(out, "certify"),
         replacing(out / "a.h5") as temporary,
     ):
         out.rename(tmp_path / "renamed")
@@ -447,14 +414,17 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 import studies
 studies.configure()
-from studies.engine.folder import finished_cases, open_folder, read_manifest
+from studies.engine.folder import SweepFolder, finished_cases, read_manifest
 from studies.engine.stored import manifest_attributes, merge
+from studies.job import locked_folder
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table
 for folder in sorted(Path(sys.argv[2]).iterdir()):
     manifest = read_manifest(folder)
     table = build_table(parse_sweep(manifest["spec"]))
-    with open_folder(folder, manifest, True) as opened:
+    with locked_folder(folder, "sweep"):
+        opened = SweepFolder(folder)
+        opened.begin(manifest)
         merge(folder, table, finished_cases(folder), manifest_attributes(manifest))
         time.sleep(0.3)  # for readers that have just listed the chunks
         opened.publish()

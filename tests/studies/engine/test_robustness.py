@@ -35,7 +35,6 @@ from studies.engine.robustness import (
 from studies.engine.stability import _loops, with_margin_modes
 from studies.errors import StudyError
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure
-from studies.sweeps.run import run_sweep
 from studies.sweeps.show import ranked_cases
 from studies.tuning import loop_figures
 from studies.tuning.check import tuned_study
@@ -44,6 +43,7 @@ from studies.tuning.loop_figures import machine_figures, term_values
 from studies.tuning.spec import LOOP_TERMS
 from tests.bare import parse_sweep
 from tests.canonical import MACHINE, study_of
+from tests.sweeps import run_sweep
 from tests.tunings import EACH, EVERY_KIND, GAIN, SMALL, tuning
 
 #: Off home, where nothing is symmetric.

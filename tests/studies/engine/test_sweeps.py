@@ -17,7 +17,6 @@ import h5py
 import numpy as np
 import pytest
 import xarray
-from rich.console import Console
 
 import studies
 from jaxmodel import status
@@ -29,22 +28,20 @@ from studies.engine.folder import (
     SweepFolder,
     finished_cases,
     make_manifest,
-    open_folder,
 )
 from studies.engine.function import TRACES
 from studies.engine.margins import no_margins
 from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import run_study
 from studies.errors import StudyError
+from studies.job import locked_folder
 from studies.space.table import build_table
 from studies.study.cases import build_structure
 from studies.sweeps import run as run_module
-from studies.sweeps.run import make_plan, run_sweep
+from studies.sweeps.run import make_plan
 from studies.sweeps.show import case_rows, margin_warning, ranked_cases
 from tests import TOP
-from tests.sweeps import FAST_MOVE, HOME_PHI, MIXED, narrow_blocks, small, small_spec
-
-SILENT = Console(file=open(os.devnull, "w"))  # noqa: SIM115
+from tests.sweeps import FAST_MOVE, HOME_PHI, MIXED, narrow_blocks, run_sweep, small, small_spec
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -62,18 +59,14 @@ def noisy_spec(sweep=MIXED):
     return small_spec(sweep, **NOISE)
 
 
-def run(spec, out, **options):
-    return run_sweep(spec, Path(out), console=SILENT, **options)
-
-
 @pytest.fixture(scope="module")
 def mixed(tmp_path_factory):
     """Folder of a finished sweep of 72 cases, and how often its program was traced."""
     out = tmp_path_factory.mktemp("mixed") / "sweep"
     function._FUNCTIONS.clear()  # of other tests
     before = len(TRACES)
-    outcome = run(noisy_spec(), out)
-    assert outcome.n_done == outcome.n_run == 72
+    outcome = run_sweep(noisy_spec(), out)
+    assert outcome.n_cases == outcome.n_run == 72 and outcome.is_good
     return out, len(TRACES) - before
 
 
@@ -113,7 +106,8 @@ def test_mode_counts_subsets_and_placements_share_one_compilation(mixed):
 
 
 def test_a_strained_patch_is_the_status_of_its_case_alone(tmp_path):
-    run(noisy_spec({"axes": {"patches.strain_limit": [1e-7, 4e-4, 1e-3]}}), tmp_path / "sweep")
+    axes = {"patches.strain_limit": [1e-7, 4e-4, 1e-3]}
+    run_sweep(noisy_spec({"axes": axes}), tmp_path / "sweep")
     data = read_sweep(tmp_path / "sweep")
     np.testing.assert_array_equal(data["status"], [status.STRAINED, status.OK, status.OK])
     peak = data["patch_strain_peak"]
@@ -124,7 +118,7 @@ def test_cases_without_a_verdict_are_not_ok(tmp_path):
     """As in a single run: their metrics hold, but no ranking takes them."""
     unjudged = mock.patch.object(chunks, "judge_loops", no_margins)
     with unjudged:
-        run(noisy_spec({"axes": {"gain": [0.5, 1.0]}}), tmp_path / "a")
+        run_sweep(noisy_spec({"axes": {"gain": [0.5, 1.0]}}), tmp_path / "a")
     data = read_sweep(tmp_path / "a")
     assert set(data["status"]) == {status.UNJUDGED}
     assert np.isfinite(data["residual_rms"]).all()
@@ -153,7 +147,7 @@ def test_results_open_in_xarray_and_in_plain_hdf5(mixed):
         assert data["control.modes"].dims == ("case",)
         assert set(data.link_subsets.values) == {"none", "1", "1+2+3"}
         assert "git" in data.attrs and float(data.attrs["run_time"]) > 0
-        assert studies.load(folder).residual_rms.equals(data.residual_rms)
+        assert studies.load(folder).data.residual_rms.equals(data.residual_rms)
     with h5py.File(folder / "results.h5") as file:
         for name, dataset in file.items():
             assert dataset.is_scale or all(len(axis) == 1 for axis in dataset.dims), name
@@ -161,11 +155,11 @@ def test_results_open_in_xarray_and_in_plain_hdf5(mixed):
 
 def test_equal_sweeps_have_equal_datasets(mixed, tmp_path):
     """In a background thread, too: signals can be caught in the main thread only."""
-    found = []
-    thread = threading.Thread(target=lambda: found.append(run(noisy_spec(), tmp_path / "again")))
+    found, out = [], tmp_path / "again"
+    thread = threading.Thread(target=lambda: found.append(run_sweep(noisy_spec(), out)))
     thread.start()
     thread.join()
-    assert found[0].n_done == 72
+    assert found[0].n_cases == 72 and found[0].is_good
     assert_same(arrays(mixed[0]), arrays(tmp_path / "again"), 0.0)
 
 
@@ -204,7 +198,7 @@ def test_impossible_cases_do_not_touch_the_others(tmp_path):
     mixed_list = [*good[:4], *(named | case for case in bad), *good[4:]]
     before = len(TRACES)
     for name, cases in (("a", good), ("b", mixed_list)):
-        run(small_spec({"method": "list", "cases": cases}), tmp_path / name)
+        run_sweep(small_spec({"method": "list", "cases": cases}), tmp_path / name)
     assert len(TRACES) == before + 1
     clean, dirty = read_sweep(tmp_path / "a"), read_sweep(tmp_path / "b")
     codes = dirty["status"]
@@ -229,7 +223,7 @@ def test_impossible_cases_do_not_touch_the_others(tmp_path):
 @pytest.mark.long
 def test_gains_from_each_cases_own_uncontrolled_run(tmp_path):
     axes = {"control.ratio_source": "all", "emc_exponent": [0.5, 1.0], "move_time": [0.008, 0.01]}
-    run(small_spec({"axes": axes}), tmp_path / "s")
+    run_sweep(small_spec({"axes": axes}), tmp_path / "s")
     data = read_sweep(tmp_path / "s")
     is_own = data["control.ratio_source"] == "own_run"
     assert is_own.sum() == 4
@@ -246,7 +240,7 @@ def test_programs_of_different_mode_counts_join(tmp_path):
         {"link.modes": 3, "control.modes": 2, "run.duration": 0.025},
         {"link.modes": 2, "control.modes": 1, "run.duration": 0.026},
     ]
-    run(small_spec({"method": "list", "cases": cases}), tmp_path / "s")
+    run_sweep(small_spec({"method": "list", "cases": cases}), tmp_path / "s")
     data = read_sweep(tmp_path / "s")
     assert np.all(data["status"] == status.OK) and data["residual_modal_rms"].shape == (2, 3, 3)
     assert np.isnan(data["residual_modal_rms"][1, :, 2]).all()
@@ -257,8 +251,8 @@ def test_programs_of_different_mode_counts_join(tmp_path):
 def test_noise_differs_between_repeats_and_is_the_same_again(tmp_path):
     electronics = {"adc_noise": 0.01}
     sweep = {"axes": {"gain": [0.5]}, "repeats": 4}
-    run(small_spec(sweep, electronics=electronics), tmp_path / "a")
-    run(small_spec(sweep, electronics=electronics), tmp_path / "b")
+    run_sweep(small_spec(sweep, electronics=electronics), tmp_path / "a")
+    run_sweep(small_spec(sweep, electronics=electronics), tmp_path / "b")
     energy = read_sweep(tmp_path / "a")["control_energy"]
     assert len(np.unique(energy)) == 4
     np.testing.assert_array_equal(energy, read_sweep(tmp_path / "b")["control_energy"])
@@ -272,7 +266,7 @@ def test_each_case_takes_the_plant_steps_that_it_takes_alone(tmp_path):
         shaper={"kind": "none"},
         control={"modes": 1, "feedback": "ideal", "velocity_gain": [0.1] * 3},
     )
-    run(spec, tmp_path / "s")
+    run_sweep(spec, tmp_path / "s")
     data = read_sweep(tmp_path / "s")
     np.testing.assert_array_equal(data["status"], [status.OK, status.SATURATED, status.TOO_STIFF])
     assert data["substeps"][0] == 1 < data["substeps"][1]
@@ -288,7 +282,7 @@ def test_a_path_out_of_reach_needs_no_plant_steps(tmp_path):
     """Of links that lengthen: longitudinal modes of a machine that cannot close mean nothing."""
     cases = [{"motion.waypoints": [[0, 0, HOME_PHI], [0, y, HOME_PHI]]} for y in (0.002, 0.9)]
     spec = small_spec({"method": "list", "cases": cases}, link={"modes": 3, "stretch": True})
-    run(spec, tmp_path / "s")
+    run_sweep(spec, tmp_path / "s")
     data = read_sweep(tmp_path / "s")
     np.testing.assert_array_equal(data["status"], [status.OK, status.OUT_OF_REACH])
     assert data["substeps"][0] == data["substeps"][1]
@@ -313,12 +307,10 @@ sys.path.insert(0, sys.argv[3])
 import studies
 studies.configure()
 studies.config.keep_programs()
-from pathlib import Path
 from studies.engine import plan
-from studies.sweeps.run import run_sweep
 from studies.space.spec import parse_sweep
 plan.LANES, plan.LARGEST_CHUNK = 8, 16
-run_sweep(parse_sweep(json.loads(sys.argv[1])), Path(sys.argv[2]))
+studies.sweep(parse_sweep(json.loads(sys.argv[1])), sys.argv[2])
 """
 
 
@@ -343,8 +335,8 @@ def test_a_killed_sweep_runs_only_what_is_left(tmp_path, mixed):
     process.communicate(timeout=120)
     done = finished_cases(out).case_id
     assert 0 < len(done) < 72
-    outcome = run(noisy_spec(), out, is_resumed=True)
-    assert outcome.n_done == 72 and outcome.n_run == 72 - len(done)
+    outcome = run_sweep(noisy_spec(), out, resume=True)
+    assert outcome.n_cases == 72 and outcome.n_run == 72 - len(done)
     assert_same(arrays(mixed[0]), arrays(out))
 
 
@@ -394,20 +386,21 @@ def partly_done(out, spec=None, number=signal.SIGINT):
     module.SweepFolder.write_chunk = write
     before = signal.getsignal(number)  # a shell starts what runs in its background without
     try:
-        outcome = run(spec, out)
+        with pytest.raises(KeyboardInterrupt, match="of 72 cases are safe") as stopped:
+            run_sweep(spec, out)
     finally:
         module.SweepFolder.write_chunk = original
-    assert outcome.is_interrupted and signal.getsignal(number) is before
-    return outcome
+    assert signal.getsignal(number) is before
+    return int(str(stopped.value).split()[0])
 
 
 def test_a_signal_finishes_the_chunk_and_says_so(tmp_path):
     """Ctrl-C; of a batch system, and what runs afterwards: the next test."""
     out = tmp_path / "s"
-    outcome = partly_done(out)
-    assert 32 <= outcome.n_done < 72
+    n_done = partly_done(out)
+    assert 32 <= n_done < 72
     data = read_sweep(out)
-    assert np.sum(data["status"] >= 0) == outcome.n_done
+    assert np.sum(data["status"] >= 0) == n_done
     assert np.isnan(data["residual_rms"][data["status"] < 0]).all()
 
 
@@ -421,7 +414,7 @@ def test_damaged_chunks_run_again(tmp_path, mixed):
     chunks[1].write_bytes(chunks[1].read_bytes()[:1000])
     (out / CHUNKS / "unfinished.tmp").write_bytes(b"half")
     before = len(finished_cases(out).case_id)
-    resumed = run(noisy_spec(), out, is_resumed=True)
+    resumed = run_sweep(noisy_spec(), out, resume=True)
     assert resumed.n_run == 72 - before >= 32
     assert_same(arrays(mixed[0]), arrays(out))
     assert len(list((out / CHUNKS).glob("*.damaged"))) == 2
@@ -441,7 +434,7 @@ def test_chunks_lost_while_it_runs_are_noticed(tmp_path):
         mock.patch.object(run_module, "finished_cases", lossy),
         pytest.raises(StudyError, match="16 of 72 cases disappeared while the sweep ran"),
     ):
-        run(noisy_spec(), out)
+        run_sweep(noisy_spec(), out)
     assert not (out / "results.h5").exists()
 
 
@@ -452,49 +445,49 @@ def test_extended_sweep_runs_only_new_cases(tmp_path):
         return noisy_spec({"axes": axes, "blocks": [inner], **more})
 
     out, longest = tmp_path / "s", spec(4, [1, 2, 3])
-    run(spec(2, [2, 3]), out)
-    with open_folder(out, make_manifest(longest.data), True) as folder:
-        folder.begin(make_manifest(longest.data))
+    run_sweep(spec(2, [2, 3]), out)
+    with locked_folder(out, "sweep"):
+        SweepFolder(out).begin(make_manifest(longest.data))
     begun = read_sweep(out)  # stopped before the first chunk: old cases are known by their ids
     assert begun.n_cases == 48 and np.sum(begun["status"] >= 0) == 16
     is_full = (begun["link.modes"] == 3) & (begun["control.modes"] == 3)  # a program of replays
     case = int(np.flatnonzero((begun["status"] >= 0) & is_full)[1])
     found = run_study(load_design(out, case).study, has_record=False, has_loop=False)
     assert deviation(found, load_design(out, case).stored)[0] < 1e-9
-    longer = run(longest, out, is_resumed=True)
-    assert longer.n_run == 48 - 16 and longer.n_done == 48
-    run(longest, tmp_path / "whole")
+    longer = run_sweep(longest, out, resume=True)
+    assert longer.n_run == 48 - 16 and longer.n_cases == 48
+    run_sweep(longest, tmp_path / "whole")
     assert_same(arrays(tmp_path / "whole"), arrays(out), 1e-9)
     other = spec(4, [1, 2, 3], metrics=["residual_rms"])
     with pytest.raises(StudyError, match="keeps the same"):
-        run(other, out, is_resumed=True)
+        run_sweep(other, out, resume=True)
     before = (out / "sweep.json").read_bytes()
     with pytest.raises(StudyError, match="finished cases in .* are not part of this sweep"):
-        run(spec(2, [2, 3]), out, is_resumed=True)
+        run_sweep(spec(2, [2, 3]), out, resume=True)
     assert (out / "sweep.json").read_bytes() == before
 
 
 def test_what_does_not_fit_is_refused(tmp_path, mixed):
     folder, _ = mixed
     with pytest.raises(StudyError, match="holds a sweep already; add --resume"):
-        run(noisy_spec(), folder)
+        run_sweep(noisy_spec(), folder)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tmp").write_text("x")
     with pytest.raises(StudyError, match="holds other files .thesis.tmp."):
-        run(noisy_spec(), tmp_path / "other")
+        run_sweep(noisy_spec(), tmp_path / "other")
     with pytest.raises(StudyError, match="holds other files .thesis.tmp."):
-        run(noisy_spec(), tmp_path / "other", is_resumed=True)
+        run_sweep(noisy_spec(), tmp_path / "other", resume=True)
     assert [x.name for x in (tmp_path / "other").iterdir()] == ["thesis.tmp"]
     (tmp_path / "file").write_text("x")
     with pytest.raises(StudyError, match="this is a file; name a folder"):
-        run(noisy_spec(), tmp_path / "file")
+        run_sweep(noisy_spec(), tmp_path / "file")
     copy = tmp_path / "copy"
     shutil.copytree(folder, copy)
     text = (copy / "sweep.json").read_text()
     digest = text.split('"code": "')[1][:16]
     (copy / "sweep.json").write_text(text.replace(digest, "0" * 16))
     with pytest.raises(StudyError, match="begun with another code"):
-        run(noisy_spec(), copy, is_resumed=True)
+        run_sweep(noisy_spec(), copy, resume=True)
     content = bytearray((copy / "results.h5").read_bytes())
     content[len(content) // 3] ^= 1
     (copy / "results.h5").write_bytes(content)
@@ -509,10 +502,10 @@ def test_two_processes_cannot_share_a_folder(tmp_path):
     """Locks of two open files exclude each other, whether one process opened them or two."""
     out = tmp_path / "s"
     with (
-        open_folder(out, make_manifest(small()), False),
-        pytest.raises(StudyError, match="another process is running a sweep there"),
+        locked_folder(out, "sweep"),
+        pytest.raises(StudyError, match="another process is at work on a sweep there"),
     ):
-        run(small_spec(), out)
+        run_sweep(small_spec(), out)
     assert not list((out / CHUNKS).glob("*"))  # nothing has begun
 
 
@@ -526,7 +519,7 @@ def test_full_disk_keeps_what_is_finished(tmp_path, mixed):
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, old[1]))
     try:
         with pytest.raises(StudyError, match="cannot write"):
-            run(noisy_spec(), out / "s")
+            run_sweep(noisy_spec(), out / "s")
         kept = len(finished_cases(out / "s").case_id)
         assert not list((out / "s" / CHUNKS).glob("*.tmp"))
         if is_mounted:
@@ -534,7 +527,7 @@ def test_full_disk_keeps_what_is_finished(tmp_path, mixed):
             subprocess.run(["mount", "-o", "remount,size=8m", str(out)], check=True, timeout=120)
         else:
             resource.setrlimit(resource.RLIMIT_FSIZE, old)
-        assert run(noisy_spec(), out / "s", is_resumed=True).n_run == 72 - kept
+        assert run_sweep(noisy_spec(), out / "s", resume=True).n_run == 72 - kept
         assert_same(arrays(mixed[0]), arrays(out / "s"))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, old)

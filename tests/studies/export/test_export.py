@@ -310,7 +310,7 @@ def test_json_follows_its_schema_and_says_what_everything_is(capsys, designs, fo
 def test_import_gives_the_study_back_exactly(capsys, designs, folders, name, tmp_path):
     out, _ = exported(capsys, designs, folders, name, "json")
     back = tmp_path / "back.toml"
-    assert run(capsys, "import-gains", out / "flexlink.json", "--out", back)[0] == 0
+    assert run(capsys, "init", back, "--from", out / "flexlink.json")[0] == 0
     assert load_study(back) == load_study(designs[name])
     again = tmp_path / "again"
     arguments = ("--target", "json", "--no-verify", "--out", again)
@@ -330,7 +330,7 @@ def test_import_refuses_changed_numbers(capsys, designs, folders, name, tmp_path
     data = json.loads((out / "flexlink.json").read_text())
     data["numbers"][name]["value"] = change(data["numbers"][name]["value"])
     (tmp_path / "changed.json").write_text(json.dumps(data))
-    arguments = ("import-gains", tmp_path / "changed.json", "--out", tmp_path / "back.toml")
+    arguments = ("init", tmp_path / "back.toml", "--from", tmp_path / "changed.json")
     message = refused(capsys, *arguments)
     assert f"numbers.{name}[0" in message and "export it again" in message
     assert not (tmp_path / "back.toml").exists()
@@ -363,7 +363,7 @@ def test_import_refuses_other_files(capsys, designs, folders, edit, message, tmp
     edit(data)
     (tmp_path / "changed.json").write_text(json.dumps(data))
     assert message in refused(
-        capsys, "import-gains", tmp_path / "changed.json", "--out", tmp_path / "back.toml"
+        capsys, "init", tmp_path / "back.toml", "--from", tmp_path / "changed.json"
     )
 
 
@@ -372,15 +372,15 @@ def test_import_refuses_other_files(capsys, designs, folders, edit, message, tmp
 )
 def test_import_refuses_what_is_no_json(capsys, content, tmp_path):
     (tmp_path / "bad.json").write_bytes(content)
-    refused(capsys, "import-gains", tmp_path / "bad.json", "--out", tmp_path / "back.toml")
+    refused(capsys, "init", tmp_path / "back.toml", "--from", tmp_path / "bad.json")
 
 
 def test_import_refuses_targets(capsys, designs, folders, tmp_path):
     out, _ = exported(capsys, designs, folders, "paper", "json")
     (tmp_path / "there.toml").write_text("")
-    there = ("import-gains", out / "flexlink.json", "--out", tmp_path / "there.toml")
+    there = ("init", tmp_path / "there.toml", "--from", out / "flexlink.json")
     assert "exists already" in refused(capsys, *there)
-    missing = ("import-gains", tmp_path / "missing.json", "--out", tmp_path / "back.toml")
+    missing = ("init", tmp_path / "back.toml", "--from", tmp_path / "missing.json")
     assert "cannot be read" in refused(capsys, *missing)
     assert import_study(out / "flexlink.json").title == "paper's gains"
 

@@ -31,7 +31,7 @@ from studies.export.fixed_blocks import design_integers
 from studies.export.floating import respond as respond_floating
 from studies.export.in_the_loop import LoopRun, replay
 from studies.export.integers import respond
-from studies.export.job import Job, check_loop
+from studies.export.request import Export, check_loop
 from studies.export.verify import (
     Check,
     Verification,
@@ -314,7 +314,7 @@ def test_factors_beyond_a_word_are_refused():
 
 def test_unstable_loops_are_refused_with_their_margin(monkeypatch):
     found = fixed_controller(parse_study(changed(PAPER, control={"gain_factor": 4.0})))
-    job = Job(found, "name", [], "", [], False, 16, Console(quiet=True), None)
+    job = Export(found, "name", [], "", [], False, 16, Console(quiet=True), None)
     message = r"gain_factor = 4.0; .* is stable: its spectral radius is 1\.\d+.*margin"
     monkeypatch.setattr(targets, "reference_motion", None)  # refused before any motion
     with pytest.raises(StudyError, match=message):

@@ -11,7 +11,7 @@ from jaxmodel.state_space import StateSpace
 from studies.engine.blocks import ModalBlocks
 from studies.engine.design import Design, as_design
 from studies.export.floating import respond
-from studies.export.job import Exported, ExportResult
+from studies.export.request import Exported, ExportResult
 from studies.export.verify import DOUBLE, WORST, Check, Verification, _limits, compare_values
 
 NOTHING = Verification(checks=[], notes=[], runs={}, exchanges={}, counts={})
@@ -79,5 +79,5 @@ def test_a_study_or_its_file_stands_for_a_design(tmp_path):
     (tmp_path / "mine.toml").write_text("")
     for given in (study, tmp_path / "mine.toml", str(tmp_path / "mine.toml"), Design(study, {})):
         assert as_design(given) == Design(study, {})
-    with pytest.raises(studies.StudyError, match="design: dict; expected a design, as load_desi"):
-        studies.export_design({}, "json", tmp_path)
+    with pytest.raises(studies.StudyError, match="dict; expected a study, its file, or a folder"):
+        studies.export({}, tmp_path, target="json")

@@ -5,7 +5,6 @@ import pytest
 
 from studies.errors import StudyError
 from studies.fitting.decays import DecaySettings, decay_modes
-from studies.fitting.estimate import estimate
 from studies.fitting.plots import drawings
 from tests.fits import (
     ASKEW,
@@ -13,6 +12,7 @@ from tests.fits import (
     FREE_OF_UNEQUAL,
     SENSORS,
     UNEQUAL,
+    fit_of,
     made,
     spec_of,
     write,
@@ -178,7 +178,7 @@ def test_a_fit_to_decays_finds_the_machine(shaken):
     start = {"link": UNEQUAL["link"] | {"damping_ratio": 0.017, "stiffness_factor": 0.96}}
     entry = DECAY | {"segment_s": 0.5, "to_hz": 700.0}
     options = {"starts": 4, "refine": 1, "profile": False}
-    fitted = estimate(spec_of(shaken, entry, free=FREE_OF_UNEQUAL, study=start, **options))
+    fitted = fit_of(spec_of(shaken, entry, free=FREE_OF_UNEQUAL, study=start, **options))
     for k, true in enumerate((1.0, 0.012)):
         assert abs(fitted.answer.values[k] - true) < 3 * fitted.answer.sigma[k]
         assert fitted.answer.sigma[k] < (0.001, 0.001)[k]

@@ -11,11 +11,11 @@ import pytest
 
 from studies.fitting import diagnosis
 from studies.fitting.diagnosis import BETTER, _of_data, _of_links, diagnose
-from studies.fitting.estimate import fit
 from studies.fitting.faults import fault_of
 from studies.fitting.say import sentences
 from studies.fitting.solve import descend
 from studies.fitting.statistics import describe_fit
+from studies.fitting.verb import fit
 from tests.fits import (
     DECAY,
     FREE_OF_UNEQUAL,

@@ -1,6 +1,5 @@
 """Fits to measurements: derivatives, uncertainty, what is not identifiable, and bad data."""
 
-import io
 import json
 import re
 import time
@@ -14,13 +13,12 @@ import numpy as np
 import pytest
 import pyuff
 import scipy
-from rich.console import Console
 from scipy.stats import chi2
 
 from jaxmodel import status
 from studies.errors import StudyError
 from studies.fitting import bench as benches
-from studies.fitting.estimate import estimate, fit
+from studies.fitting import estimate as estimating
 from studies.fitting.kinds.contract import Line
 from studies.fitting.kinds.modes import TWO_PI, pair_modes
 from studies.fitting.measurements import make_bench
@@ -28,11 +26,12 @@ from studies.fitting.plots import curves, drawings, samples
 from studies.fitting.posterior import log_density, sample, shape
 from studies.fitting.problem import check_sanity, make_problem
 from studies.fitting.profiles import profile
-from studies.fitting.run import machines, run_fit
+from studies.fitting.run import machines
 from studies.fitting.say import sentences, undetermined
 from studies.fitting.solve import descend, solve
 from studies.fitting.statistics import describe_fit
 from studies.fitting.tables import column, read_columns
+from studies.fitting.verb import fit
 from studies.publish import check_folder
 from studies.study.spec import load_study
 from studies.tuning.spec import load_tuning
@@ -54,6 +53,7 @@ from tests.fits import (
     TRACE,
     Ringing,
     blank,
+    fit_of,
     made,
     measured_modes,
     posed,
@@ -217,7 +217,7 @@ def test_three_numbers_that_belong_together_are_one_group(folder):
     entry = {"kind": "modes", "ends": "held", "frequency_hz": [114.4, 457.6], "sigma_hz": 0.5}
     study = {"link": SHORT["link"] | {"youngs_modulus": 71e9}}
     options = {"starts": 4, "profile": False}
-    found = estimate(spec_of(folder, entry, entry | {"link": 2}, free=free, study=study, **options))
+    found = fit_of(spec_of(folder, entry, entry | {"link": 2}, free=free, study=study, **options))
     (sentence,) = undetermined(found)
     assert "determine 1 combination of these 3 parameters" in sentence and "Fix 2" in sentence
 
@@ -261,7 +261,7 @@ def test_the_paper_s_frequencies_from_modulus_and_joint(tmp_path):
     }
     entry = {"kind": "modes", "ends": "held", "frequency_hz": [92.5, 241.3], "sigma_hz": 0.5}
     study = {"link": SHORT["link"] | {"basis": "loaded", "joint_inertia_c": 5e-6}}
-    found = estimate(spec_of(tmp_path, entry, free=free, study=study, starts=4))
+    found = fit_of(spec_of(tmp_path, entry, free=free, study=study, starts=4))
     answer = found.answer
     assert answer.chi_square < 1e-6
     low, high = answer.interval.T
@@ -357,7 +357,7 @@ def test_an_optimum_at_a_bound(folder):
     spec = spec_of(folder, entry, free={"link.youngs_modulus": {"from": 60e9, "to": 72e9}})
     with pytest.raises(StudyError, match="samples = 3; allowed: 0, or 20"):
         parse_fit(spec.data | {"fit": spec.data["fit"] | {"samples": 3}})
-    found = estimate(spec._replace(fit=spec.fit.model_copy(update={"samples": 20, "starts": 4})))
+    found = fit_of(spec._replace(fit=spec.fit.model_copy(update={"samples": 20, "starts": 4})))
     assert found.answer.values[0] == pytest.approx(72e9, rel=1e-6)
     assert np.all(np.diff(found.profiles[0].values) > 0)
     assert "link.youngs_modulus ended at its upper bound, 72 GPa" in " ".join(sentences(found))
@@ -740,8 +740,13 @@ def test_a_fit_is_written_with_what_it_cannot_predict(folder, tmp_path):
     options = {"starts": 2, "refine": 1, "profile": False, "next": own}
     free = FREE | {"machine.platform_mass": mass}
     spec = spec_of(folder, ONE_MODE, second, swapped, free=free, **options)
-    found = run_fit(spec, tmp_path / "out", Console(file=io.StringIO()))
+    found = fit(spec, tmp_path / "out", progress=False)
     assert "check the units" in found.unpredicted[0]
+    whole = (tmp_path / "out" / "fit.json").read_bytes()
+    again = ("solve", "describe_confirmed", "draw_machines", "next_experiments")
+    with mock.patch.multiple(estimating, **dict.fromkeys(again)):  # no part is found twice
+        fit(spec, tmp_path / "out", resume=True, progress=False)
+    assert (tmp_path / "out" / "fit.json").read_bytes() == whole
     document = json.loads((tmp_path / "out" / "fit.json").read_text())
     is_noise = {x["name"]: x["is_noise"] for x in document["held_out"]}
     assert is_noise == {"second link": True, swapped["name"]: False} and document["messages"]

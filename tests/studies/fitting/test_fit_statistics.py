@@ -212,7 +212,7 @@ def test_other_optima_have_the_rise_of_chi_square():
     best = SimpleNamespace(u=np.array([0.4]), cost=12.0)
     found = SimpleNamespace(
         names=["link.damping_ratio"],
-        solution=Solution((best, *other), 3),
+        solution=Solution((best, *other), 3, best.u),
         spec=SimpleNamespace(free=Free()),
     )
     assert _others(found) == [["3", "12"], ["0.5", "28"]]

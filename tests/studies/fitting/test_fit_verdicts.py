@@ -1,31 +1,41 @@
 """What a fit says of its own result: equally good optima, what is identifiable, drawn machines."""
 
-import io
 import json
 import re
+from dataclasses import replace
 from functools import cache
 
 import jsonschema
 import numpy as np
 import pytest
-from rich.console import Console
 from scipy.stats import chi2
 
 from studies.documents import schema
 from studies.errors import StudyError
 from studies.fitting import run
 from studies.fitting.bench import Modes
-from studies.fitting.estimate import estimate, is_good
+from studies.fitting.estimate import is_good
 from studies.fitting.experiment import next_experiments
 from studies.fitting.kinds.modes import Measured, pair_modes
-from studies.fitting.run import run_fit
 from studies.fitting.say import describe_direction, say, sentences
-from studies.fitting.solve import SAME, Solution, exchanges
+from studies.fitting.solve import SAME, exchanges
 from studies.fitting.spec import load_fit
 from studies.fitting.statistics import UNKNOWN, describe_fit
+from studies.fitting.verb import fit
 from studies.tuning.spec import load_tuning
 from tests import TOP
-from tests.fits import ASKEW, FREQUENCY, RESPONSE, answered, blank, made, posed, spec_of, write
+from tests.fits import (
+    ASKEW,
+    FREQUENCY,
+    RESPONSE,
+    answered,
+    blank,
+    fit_of,
+    made,
+    posed,
+    spec_of,
+    write,
+)
 from tests.pages import text_of
 
 HOME = [0.0, 0.0, 0.5235987755982988]
@@ -35,7 +45,6 @@ LINK = {"modes": 3, "damping_ratio": 0.012, "youngs_modulus": EQUAL}
 #: More modes, axial inertia of every point.
 RICHER = {"modes": 6, "axial_inertia": "distributed"}
 PAYLOAD = {"mass": 0.3, "inertia": 2e-4}
-QUIET = Console(quiet=True)
 HERE = "."  # no files
 
 
@@ -103,7 +112,7 @@ def check(case, found):
 
 @cache
 def estimated(name):
-    return estimate(CASES[name].spec(1))
+    return fit_of(CASES[name].spec(1))
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -115,7 +124,7 @@ def test_no_wrong_assignment_is_good(name):
 @pytest.mark.parametrize("name", CASES)
 def test_no_wrong_assignment_is_good_in_20_repetitions(name):
     case = CASES[name]
-    found = [check(case, estimate(case.spec(seed))) for seed in range(1, 21)]
+    found = [check(case, fit_of(case.spec(seed))) for seed in range(1, 21)]
     right, good = (sum(x[k] for x in found) for k in (0, 1))
     rise = np.array([x[2] for x in found])
     print(f"{name}: {right} right, {good} good; rises {rise.mean():.2f}, at most {rise.max():.2f}")
@@ -133,7 +142,7 @@ def exchanged(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("studies.fitting.estimate.next_experiments", fail)
         patch.setattr(run, "estimate", lambda *_: known)
-        found = run_fit(known.spec, out, Console(file=io.StringIO()))
+        found = fit(known.spec, out, progress=False)
     return out, found
 
 
@@ -180,7 +189,7 @@ def test_results_are_written_before_experiments_are_sought(exchanged, tmp_path, 
     monkeypatch.setattr("studies.fitting.estimate.next_experiments", end)
     monkeypatch.setattr(run, "estimate", lambda *_: exchanged[1])
     with pytest.raises(KeyboardInterrupt):
-        run_fit(exchanged[1].spec, tmp_path / "out", QUIET)
+        fit(exchanged[1].spec, tmp_path / "out", progress=False)
     written = {x.name for x in (tmp_path / "out").iterdir()}
     assert written == {x.name for x in exchanged[0].iterdir()} - {"fit.json"}
 
@@ -277,8 +286,8 @@ def test_the_right_assignment_is_found_by_exchange():
     found = estimated("payload")
     np.testing.assert_allclose(found.answer.values, UNEQUAL, rtol=1e-3)
     assert is_good(found) and found.rivals == ()
-    unfinished = Solution((found.solution.best._replace(is_converged=False),), 1)
-    assert not is_good(found._replace(solution=unfinished))
+    unfinished = found.solution._replace(optima=(found.solution.best._replace(is_converged=False),))
+    assert not is_good(replace(found, solution=unfinished))
     assert all(found.solution.rise(x) > 30 for x in found.solution.others)
 
 
@@ -343,7 +352,7 @@ def along_a_curve():
         "damping_sigma": 1e-3,
     }
     study = {"link": LINK | {"youngs_modulus": 70e9}}
-    return estimate(spec_of(HERE, entry, free=free, study=study))
+    return fit_of(spec_of(HERE, entry, free=free, study=study))
 
 
 def test_what_profiles_do_not_end_is_not_identifiable(along_a_curve):
@@ -373,7 +382,7 @@ def test_a_pair_that_is_not_identifiable_is_named(along_a_curve):
 def test_correlated_pairs_are_named_beside_those_that_are_not_identifiable(along_a_curve):
     answer = along_a_curve.answer
     correlation = np.array([[1.0, -1.0, 0.97], [-1.0, 1.0, 0.2], [0.97, 0.2, 1.0]])
-    found = along_a_curve._replace(answer=answer._replace(correlation=correlation))
+    found = replace(along_a_curve, answer=answer._replace(correlation=correlation))
     said = [x for x in sentences(found) if "strongly correlated" in x]
     assert len(said) == 1 and said[0].startswith("Parameters link.youngs_modulus and")
     assert " link.damping_ratio are strongly correlated" in said[0]
@@ -405,7 +414,7 @@ def test_correlated_noise_is_said_once(tmp_path):
     model, rng = one.predict(values, False)[0], np.random.default_rng(0)
     real, imag = (x + 0.8e-3 * noise_of(0.9, rng, len(x)) for x in (model.real, model.imag))
     write(tmp_path, "response.csv", frequency_hz=FREQUENCY, real=real, imag=imag)
-    found = estimate(spec)
+    found = fit_of(spec)
     text = " ".join(sentences(found))
     assert text.count("The noise of response 1 is correlated") == 1 and not is_good(found)
     assert "too small" not in text and "too large" not in text

@@ -5,13 +5,11 @@ import json
 import jsonschema
 import numpy as np
 import pytest
-from rich.console import Console
 from scipy.stats import chi2
 
 from studies.documents import schema
 from studies.errors import StudyError
-from studies.fitting.estimate import fit
-from studies.fitting.run import run_fit
+from studies.fitting.verb import fit
 from tests.fits import (
     FREQUENCY,
     MAGNITUDE,
@@ -56,7 +54,7 @@ def test_they_are_found_beside_the_parameters(tmp_path):
     quick = {"starts": 2, "refine": 1, "profile": False}
     quick["next"] = {"inputs": ["actuator 1.1"], "outputs": ["sensor 1.1"]}
     spec = spec_of(tmp_path, OWN | UNKNOWN, **quick)
-    found = run_fit(spec, tmp_path / "out", Console(quiet=True))
+    found = fit(spec, tmp_path / "out", progress=False)
     assert found.answer.is_explained
     assert 2 * len(FREQUENCY) - found.answer.freedom in (4, 5)  # one direction may be open
     assert np.all(np.abs(found.answer.values - truth) < 4 * found.answer.sigma)

@@ -1,6 +1,7 @@
 """`studies laws`: candidates, what they are judged on, and whether an order is certain."""
 
 import json
+from dataclasses import replace
 from threading import Event
 from time import sleep
 from types import SimpleNamespace
@@ -56,6 +57,7 @@ from studies.laws.tuning import (
     tune_candidate,
     tuning_of,
 )
+from studies.laws.verb import compare
 from studies.results.labelled import plain
 from studies.space.table import build_table
 from studies.study.cases import build_cases, build_structure
@@ -64,6 +66,7 @@ from studies.study.window import with_window
 from studies.tuning.optimise import _fresh_progress
 from tests.bare import paper_study, parse_study
 from tests.canonical import MACHINE, study_of
+from tests.jobs import quiet_job
 from tests.pages import tables_of
 
 #: A run long enough for control to tell.
@@ -222,7 +225,7 @@ def test_the_slowest_move_fits_into_the_run():
 )
 def test_a_design_without_controller_is_refused(fields, message, tmp_path):
     with pytest.raises(StudyError, match=message):
-        laws.run_laws(STUDY.change(**fields), tmp_path / "out", is_quiet=True)
+        compare(STUDY.change(**fields), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -250,14 +253,14 @@ def test_a_tuning_that_fails_ends_those_beside_it(tmp_path):
             raise
 
     pair = [Contender(name, {}, {}, {}) for name in ("bad", "good")]
-    told = SimpleNamespace(begin=lambda *_: None, advance=lambda *_: None)
+    told = quiet_job(tmp_path, ("tune",))
     with (
         mock.patch.multiple(
             laws, law_candidates=lambda _: pair, drive_candidates=lambda _: [], tune_candidate=tune
         ),
         pytest.raises(StudyError, match="bad"),
     ):
-        laws._tune(STUDY, tmp_path, Budget(50.0, 0.4), told)
+        laws._tune(STUDY, Budget(50.0, 0.4), told, None)
     assert ended.wait(5)
 
 
@@ -411,14 +414,14 @@ def compared(tmp_path):
     ]
     drive = tuned(Contender("PD", {}, {}, {}, is_drive=True), STUDY)
     with mock.patch.multiple(laws, _tune=lambda *arguments: [*tunings, drive], MACHINES=2):
-        yield laws.run_laws(STUDY, tmp_path / "out", 50.0, 0.4, is_quiet=True)
+        yield compare(STUDY, tmp_path / "out", voltage=50.0, progress=False)
 
 
 def test_a_comparison_writes_a_page_whose_order_is_that_of_the_runs(tmp_path, compared):
     findings = compared
     assert findings.name(findings.ranking.best) == "strong + PD"
     document = json.loads((tmp_path / "out" / "laws.json").read_text())
-    jsonschema.validate(document, schema("laws"))
+    jsonschema.validate(document, schema("compare"))
     names = [entry["controller"]["name"] for entry in document["controllers"]]
     assert names[:2] == ["strong + PD", "weak + PD"]
     own = findings.judged.metrics["residual_rms"]
@@ -449,13 +452,13 @@ def test_a_comparison_writes_a_page_whose_order_is_that_of_the_runs(tmp_path, co
     assert 0 < strong["rms_voltage"] < strong["peak_voltage"]
     assert strong["residual_rms"] == pytest.approx(np.exp(np.log(own[3]).mean()))
     assert beyond_budget(findings, 3) == ""
-    tight = findings._replace(budget=findings.budget.replace(voltage=1e-3, margin=1.99))
+    tight = replace(findings, budget=findings.budget.replace(voltage=1e-3, margin=1.99))
     text = beyond_budget(tight, 3)
     assert "(tuned to 0.001 V)" in text and "a disk margin below 1.99 on" in text
     html = findings._repr_html_()
     assert "strong + PD" in html and html.count("data:image/png;base64,") == 1
     with pytest.raises(StudyError, match="begun with another budget"):
-        laws.run_laws(STUDY, tmp_path / "out", 40.0, 0.4, is_resumed=True, is_quiet=True)
+        compare(STUDY, tmp_path / "out", voltage=40.0, resume=True)
 
 
 @pytest.mark.parametrize(

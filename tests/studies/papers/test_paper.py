@@ -1,19 +1,18 @@
 """The paper's study end to end on a short run, and the tables and numbers it reports."""
 
 import csv
-import io
 import json
 import re
 from types import SimpleNamespace
 from typing import NamedTuple
 from unittest import mock
 
+import jax
 import jsonschema
 import numpy as np
 import pytest
 import xarray
 from matplotlib.figure import Figure
-from rich.console import Console
 
 from studies.atlas import atlas_sweep, read_subsets
 from studies.cli import main
@@ -37,9 +36,10 @@ from studies.show.units import span
 from studies.store import read_store
 from studies.study.labels import describe
 from studies.study.printed import TABLE_1
-from studies.sweeps.run import run_sweep
 from tests.bare import paper_study
+from tests.jobs import quiet_job
 from tests.pages import text_of
+from tests.sweeps import run_sweep
 
 #: Figures that are written; the others are only drawn.
 FIGURES = ("fig03", "shapers")
@@ -87,15 +87,14 @@ class Short(NamedTuple):
 def short(tmp_path_factory):
     folder = tmp_path_factory.mktemp("paper")
     cases = list(filter(is_short, paper_cases.paper_cases()))
-    console = Console(record=True, width=120, file=io.StringIO())
     few = {name: paper_figures.PAPER_FIGURES[name] for name in FIGURES}
     with (  # what is replaced is part of no program: they are kept
         mock.patch.object(paper_cases, "JUDGED", ()),
         mock.patch.object(say, "PAPER_FIGURES", few),
     ):
-        machines = paper.evaluate(other_machine(), short_study(), cases, lambda *_: None)
-        papers.run_card(card_of(machines), folder, console)
-    return Short(folder, machines, console.export_text())
+        machines = paper.evaluate(other_machine(), short_study(), cases, quiet_job(folder))
+        result = papers.examined(card_of(machines), quiet_job(folder, papers.PHASES))
+    return Short(folder, machines, "\n".join([*result.report().result, *result.told()]))
 
 
 def card_of(machines):
@@ -107,8 +106,20 @@ def test_folder_holds_whole_files_and_nothing_else(short):
     names = sorted(file.name for file in short.folder.iterdir())
     figures = [f"{name}.png" for name in FIGURES]
     data = ["fitted.h5", "nominal.h5", "comparison.csv", "runs.csv", "claims.json"]
-    assert names == sorted([*figures, *data, "machine.png", "report.html"])
+    assert names == sorted([*figures, *data, "machine.png", "report.html", "parts"])
     assert (short.folder / "fig03.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_a_resumed_card_runs_nothing_twice(short, monkeypatch):
+    monkeypatch.setattr(paper, "run_cases", None)
+    cases = list(filter(is_short, paper_cases.paper_cases()))
+    again = paper.evaluate(other_machine(), short_study(), cases, quiet_job(short.folder))
+    assert [x.runs.cases for x in again] == [x.runs.cases for x in short.machines]
+    jax.tree.map(
+        np.testing.assert_array_equal,
+        [(x.runs.result, x.measures) for x in again],
+        [(x.runs.result, x.measures) for x in short.machines],
+    )
 
 
 def test_status_of_every_case_is_written(short):
@@ -131,7 +142,7 @@ def test_outcome_of_every_claim_is_printed_and_kept(short):
     for claim in found["claims"]:
         assert claim["found"] in page
     assert found["left_open"] == list(LEFT_OPEN) and all(x[1:] in page for x in LEFT_OPEN)
-    assert "report.html" in short.printed and "fitted.h5" in short.printed
+    assert str(short.folder / "report.html") in short.printed and "data" in short.printed
 
 
 @pytest.mark.filterwarnings("error")
@@ -237,8 +248,7 @@ def test_atlas_has_the_numbers_of_the_paper_s_cases(tmp_path, monkeypatch):
     residual = measure(runs).residual
     study = runs.study.change(control__ratio_source="own_run")
     settings = tuple((time, shaper) for time in MOVES.values() for shaper in SHAPERS)
-    quiet = Console(file=io.StringIO())
-    run_sweep(atlas_sweep(study, settings), tmp_path / "runs", console=quiet)
+    run_sweep(atlas_sweep(study, settings), tmp_path / "runs")
     seen = read_subsets(tmp_path / "runs").whole_links()
     for place, (time, shaper) in enumerate(settings):
         move = next(name for name, value in MOVES.items() if value == time)
@@ -325,7 +335,7 @@ def test_settling_times_of_the_result_are_those_of_its_table(short):
 
 
 def test_every_figure_stands_beside_its_table(short):
-    report = paper.result_of(short.machines).report
+    report = paper.result_of(short.machines).page
     drawn = [part.name for part in report.parts if isinstance(part, Drawing)]
     assert sorted(drawn) == sorted(["machine", *paper_figures.PAPER_FIGURES])
 
@@ -384,7 +394,7 @@ def test_failure_while_writing_leaves_old_files_whole(short, tmp_path, monkeypat
 
     monkeypatch.setattr(papers, "write_report", fail)
     with pytest.raises(StudyError, match="disk full"):
-        papers.run_card(card_of(short.machines), tmp_path, Console(quiet=True))
+        papers.examined(card_of(short.machines), quiet_job(tmp_path, papers.PHASES))
     assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
     assert (tmp_path / "report.html").read_text() == "old"
 

@@ -1,6 +1,7 @@
 """Reports of certificates and tunings on made-up findings: every number against its source."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -500,7 +501,8 @@ def test_placements_are_shown_in_millimetres_along_each_link():
         best_peaks=np.zeros((1, 0)),
     )
     audited = [Disagreement("placement[2][0]", "tuned", 0, "objective", 1.0, 1.0, 0.0)]
-    found = found._replace(
+    found = replace(
+        found,
         spec=spec,
         at=at,
         judged=found.judged[:1],
@@ -553,5 +555,5 @@ def test_a_tuning_s_summary_and_recommendation():
     assert found._repr_html_().count("data:image/png;base64,") == 1
     alone = spec.tune.scenarios.model_copy(update={"spread": {}, "machines": {}})
     spec = spec._replace(tune=spec.tune.model_copy(update={"scenarios": alone}))
-    _, first, *_, last = say_tuning(found._replace(spec=spec)).result
+    _, first, *_, last = say_tuning(replace(found, spec=spec)).result
     assert "on 3 runs of the nominal machine" in first and "nothing of robustness" in last

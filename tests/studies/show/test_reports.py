@@ -8,12 +8,13 @@ import pytest
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS, Metrics, Sizes
-from jaxmodel.simulate import Result
+from jaxmodel.simulate import RunResult
 from studies.engine.runs import Run
 from studies.engine.stability import LoopFigures
 from studies.show.pages import page
 from studies.show.units import READABLE, headed, number, readable, settling_text
 from studies.show.words import control_text
+from studies.single.run import Simulation
 from studies.single.say import say
 from studies.study.cases import build_case, build_structure
 from studies.study.margin import GUESSED, caution, margin_in_db, margin_text
@@ -144,7 +145,7 @@ def made_up_run(size=1.0, margin=3.25, code=status.OK, **changes):
         chord_deflection_stations=1e-5 * RNG.uniform(1, 9, (20, 3, 3)) * signs,
         pose_error=1e-4 * RNG.uniform(1, 9, (20, 3)) * signs[:, 0],
     )
-    result = Result(
+    result = RunResult(
         metrics=Metrics(values | changes),
         status=np.array(code),
         bad_time=np.array(0.0),
@@ -178,10 +179,23 @@ def made_up_run(size=1.0, margin=3.25, code=status.OK, **changes):
     )
 
 
+class Told(Simulation):
+    """A run that its sweep has something to say of."""
+
+    notes = ("a note",)
+
+
+def page_of(run, twin=None):
+    """The page of a run and of the same without control."""
+    found = Told(run, name="mine.toml")
+    found.__dict__["free"] = twin
+    return page(say(found))
+
+
 @pytest.fixture(scope="module")
 def one_run():
     run, twin = made_up_run(), made_up_run(7.0)
-    return run, twin, page(say(run, twin, ["a note"], "mine.toml"))
+    return run, twin, page_of(run, twin)
 
 
 def test_tables_of_a_run_show_its_numbers(one_run):
@@ -268,7 +282,7 @@ def test_sentences_of_a_run_show_its_numbers(one_run):
         f"({force.min():.3g} to {force.max():.3g} N), the margin goes from "
         f"{planned.min():.4g} ({20 * np.log10(planned.min()):.1f} dB) to {planned.max():.4g} ",
         "A note.",
-        "`studies spillover mine.toml --out certificate`",
+        "`studies certify mine.toml --out certificate`",
     ):
         assert part in words, part
 
@@ -277,10 +291,10 @@ def test_sentences_of_a_run_show_its_numbers(one_run):
     ("run", "twin", "verdict", "words"),
     [
         ({"margin": 1.75}, 7.0, "too little margin", "lower `control.gain_factor`"),
-        ({"margin": 2.0}, 7.0, "control works", "`studies spillover"),
+        ({"margin": 2.0}, 7.0, "control works", "`studies certify"),
         ({"size": 7.0}, 0.7, "**control makes it worse**", "lower `control.gain_factor`, or leave"),
         ({}, 1e-4, "hardly anything to suppress", "less than 2.5 µm is left"),
-        ({}, None, "not compared with a run without control", "`studies spillover"),
+        ({}, None, "not compared with a run without control", "`studies certify"),
     ],
 )
 def test_what_a_run_means_and_what_is_recommended_next(run, twin, verdict, words):
@@ -290,7 +304,7 @@ def test_what_a_run_means_and_what_is_recommended_next(run, twin, verdict, words
     one.result.metrics["residual_rms"] = rms * run.get("size", 1.0)
     if other is not None:
         other.result.metrics["residual_rms"] = rms * twin
-    html = page(say(one, other))
+    html = page_of(one, other)
     text = text_of(html)
     assert f" dB): {verdict}" in text.splitlines()[2]
     assert words in text.partition("**Next steps:**")[2].partition("![")[0]
@@ -311,7 +325,7 @@ def test_the_first_line_says_where_control_delays_settling(before, words):
     run, free = (made_up_run(1.0, 3.25, residual_rms=k * rms) for k in (1, 2))
     run.result.metrics["settling_time"] = np.full(3, 0.01325)
     free.result.metrics["settling_time"] = np.full(3, before)
-    first = text_of(page(say(run, free))).splitlines()[2]
+    first = text_of(page_of(run, free)).splitlines()[2]
     said = "**Result:** Status: **ok**. Residual 10 µm rms on link 1, the worst (20 without"
     assert first.startswith(said)
     assert f"control, -50 %), gain margin 3.25 (10.2 dB): {words}" in first
@@ -325,7 +339,7 @@ def test_a_run_that_stopped_says_when():
         loop=None,
         motion=None,
     )
-    text = text_of(page(say(run)))
+    text = text_of(page_of(run))
     assert "**Result:** Status: **diverged: bending beyond a" in text
     assert "The run stopped at 187.5 ms." in text.partition("**Question:**")[0]
     assert "esidual 0" not in text and "gain margin" not in text

@@ -13,10 +13,9 @@ from studies.space.table import build_table, designs
 from studies.study.fields import _LAWS, _RULES, idle_axes
 from studies.study.spec import Study
 from studies.sweeps.dry_run import Estimate, axes_of
-from studies.sweeps.run import run_sweep
 from tests.canonical import MACHINE
 from tests.studies.test_cli import run
-from tests.sweeps import narrow_blocks, small_spec
+from tests.sweeps import narrow_blocks, run_sweep, small_spec
 
 NONE = [False] * 3
 #: What says that a field is idle, and another value of it.
@@ -85,7 +84,7 @@ ACTING = ({"control.links": [True, False, False]}, "control.gain_factor", 0.5)
 def equal_runs(spec, folder):
     """Whether the two cases of each pair have equal results, up to rounding; all are run."""
     with patch.object(tables, "acting_columns", lambda _, columns: columns), narrow_blocks():
-        run_sweep(spec, folder, is_quiet=True)
+        run_sweep(spec, folder)
         data = read_sweep(folder)
         origin = data.table.origin
     assert np.all(origin[::2] != origin[1::2])

@@ -16,10 +16,9 @@ from studies.space.table import build_table, case_study
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure, case_of
 from studies.study.fields import Fields, padded
 from studies.study.numbers import study_numbers
-from studies.sweeps.run import run_sweep
 from tests.bare import parse_sweep
 from tests.canonical import MACHINE
-from tests.sweeps import BASE, MIXED, small, small_spec
+from tests.sweeps import BASE, MIXED, run_sweep, small, small_spec
 
 
 def table_of(sweep, **sections):
@@ -159,7 +158,7 @@ def test_id_and_seed_belong_to_the_case_not_to_the_sweep():
 )
 def test_cases_that_differ_in_no_number_run(sweep, count, tmp_path):
     """They share every array, seeds included, as long as there is no noise."""
-    done = run_sweep(parse_sweep(MACHINE | {"sweep": sweep}), tmp_path / "sweep", is_quiet=True)
+    done = run_sweep(parse_sweep(MACHINE | {"sweep": sweep}), tmp_path / "sweep")
     assert done.n_run == count
     rms = read_sweep(tmp_path / "sweep")["structural_rms"]
     assert len(rms) == count and np.isfinite(rms).all()

@@ -550,7 +550,7 @@ def test_certificates_hold_their_proofs():
     for proofs in (None, PROVEN):
         found = found.replace(proofs=proofs)
         data = json.loads(json_text(found))
-        jsonschema.validate(data, schema("spillover"))
+        jsonschema.validate(data, schema("certify"))
         assert (data["proofs"] is None) == (proofs is None)
         assert ("roven: no unstable machine" in page(say(found))) == (proofs is not None)
     assert data["proofs"]["box"]["is_proven"] and data["proofs"]["all_modes"]["margin"] == 3.5
@@ -591,7 +591,7 @@ def test_an_unstable_machine_of_the_box_fails_a_design_whose_plants_pass(near):
         "1.2 required"
     )
     data = json.loads(json_text(failed))
-    jsonschema.validate(data, schema("spillover"))
+    jsonschema.validate(data, schema("certify"))
     assert not data["is_passed"] and data["verdict"] == failed.verdict
     assert data["fails_from"] == 0
     words = " ".join(text_of(page(say(failed))).split())

@@ -461,7 +461,7 @@ def write(folder, **changes):
 def test_command_passes_a_design_and_writes_everything(capsys, tmp_path, move):
     design, out = write(tmp_path), tmp_path / "deep" / "out"
     code, text, _ = run(
-        capsys, "spillover", design, "--out", out, "--pdf", "--tolerance", "patch=5e-4"
+        capsys, "certify", design, "--out", out, "--pdf", "--tolerance", "patch=5e-4"
     )
     assert code == 0 and "passed: gain margin 2.88, 2 required" in text
     assert CHANGE.text in text
@@ -471,7 +471,7 @@ def test_command_passes_a_design_and_writes_everything(capsys, tmp_path, move):
         for kind in ("png", "pdf")
     ]
     files = {"report.html", "certificate.json", "spillover.h5", *drawn}
-    assert {path.name for path in out.iterdir()} == files
+    assert {path.name for path in out.iterdir()} == files | {".lock", "request.json", "parts"}
     assert (out / "damping.pdf").read_bytes()[:5] == b"%PDF-"
     report = text_of((out / "report.html").read_text(encoding="utf-8"))
     assert ": spillover certificate passed\n" in report
@@ -482,7 +482,7 @@ def test_command_passes_a_design_and_writes_everything(capsys, tmp_path, move):
     page = parsed((out / "report.html").read_text())
     assert len(page.images) == 4 and page.title.endswith("spillover certificate passed")
     data = json.loads((out / "certificate.json").read_text())
-    jsonschema.validate(data, schema("spillover"))
+    jsonschema.validate(data, schema("certify"))
     assert data["is_passed"] and len(data["plants"]) == 8
     assert data["fast_move"]["residual_rms"] == move.residual_rms.tolist()
     assert "| delay | 0.5 samples late | +2.00 |" in report and "patch 0.0005 m," in report
@@ -495,38 +495,56 @@ def test_command_passes_a_design_and_writes_everything(capsys, tmp_path, move):
         np.testing.assert_array_equal(store.residual_rms.sel(control="off"), move.residual_rms[1])
 
 
-@pytest.mark.usefixtures("few")
+@pytest.mark.usefixtures("few", "undrawn")
 def test_another_design_s_certificate_is_left_alone(capsys, tmp_path):
     out = tmp_path / "out"
-    out.mkdir()
-    kept = json.dumps({"study": STUDY.change(control__gain_factor=0.1).model_dump(mode="json")})
-    (out / "certificate.json").write_text(kept)
-    said = refused(capsys, "spillover", write(tmp_path), "--out", out)
-    assert "has the certificate of another design" in said
-    assert (out / "certificate.json").read_text() == kept
+    run(capsys, "certify", write(tmp_path), "--out", out)
+    kept = (out / "certificate.json").read_bytes()
+    for changes, *more in (
+        ({"control__gain_factor": 0.1},),
+        ({}, "--margin", 3),
+        ({}, "--prove"),
+        ({}, "--tolerance", "patch=0"),
+    ):
+        arguments = ("certify", write(tmp_path, **changes), "--out", out, *more)
+        assert "holds a certificate already" in refused(capsys, *arguments)
+        assert "was begun with another input" in refused(capsys, *arguments, "--resume")
+    assert (out / "certificate.json").read_bytes() == kept
 
 
 @pytest.mark.usefixtures("few", "undrawn")
-def test_a_certificate_is_made_again_in_its_folder(capsys, tmp_path):
-    """Also that of a design whose ratios come from its own run and are written as numbers."""
+def test_a_certificate_goes_on_where_it_was_interrupted(capsys, tmp_path):
+    """Also that of a design whose ratios come from its own run; nothing is judged twice."""
     design, out = write(tmp_path, control__ratio_source="own_run"), tmp_path / "out"
-    for _ in range(2):
-        assert run(capsys, "spillover", design, "--out", out)[0] in (0, 1)
-    assert (out / "certificate.json").exists()
+    arguments = ("certify", design, "--out", out)
+    with mock.patch.object(spillover_run, "run_fast_move", side_effect=KeyboardInterrupt):
+        code, _, said = run(capsys, *arguments)
+    words = " ".join(map(str, arguments))
+    assert code == 130 and f"finished work is safe; continue with: studies {words} --resume" in said
+    assert not (out / "certificate.json").exists()
+    whole = tmp_path / "whole"
+    code, text, _ = run(capsys, "certify", design, "--out", whole)
+    forbidden = mock.Mock(side_effect=AssertionError("once more"))
+    with mock.patch.multiple(spillover_run, certify=forbidden, smallest_change=forbidden):
+        assert run(capsys, *arguments, "--resume")[0] == code
+    with mock.patch.object(spillover_run, "run_fast_move", forbidden):  # once it has ended, too
+        assert run(capsys, *arguments, "--resume")[0] == code
+    for name in ("certificate.json", "spillover.h5"):
+        assert (out / name).read_bytes() == (whole / name).read_bytes()
 
 
 @pytest.mark.usefixtures("few", "undrawn")
 def test_command_fails_a_design(capsys, tmp_path):
     design, out = write(tmp_path, **DIFFERENCE), tmp_path / "out"
     with mock.patch.object(spillover_run, "run_fast_move", side_effect=StudyError("not today")):
-        code, text, _ = run(capsys, "spillover", design, "--out", out, "--margin", "1.5")
+        code, text, _ = run(capsys, "certify", design, "--out", out, "--margin", "1.5")
     assert code == 1 and "failed by mode" in text and "unstable" in text
     assert "no fast move: not today" in text
     report = text_of((out / "report.html").read_text(encoding="utf-8"))
     assert "**Failed by mode" in report and "## The fast move" not in report
-    assert "| no |" in report and "- No fast move: not today" in report
+    assert "| no |" in report and "No fast move: not today" in report
     data = json.loads((out / "certificate.json").read_text())
-    jsonschema.validate(data, schema("spillover"))
+    jsonschema.validate(data, schema("certify"))
     assert not data["is_passed"]
 
 
@@ -535,7 +553,7 @@ def test_command_fails_a_design_with_an_unstable_machine_in_its_box(capsys, tmp_
     box = ProvenBox(BOX, 1.0, True, 12, cells=0, seconds=0.0, unstable=(0.95, 1.0, 0.1))
     proofs, out = Proofs(AllModes(3.5, 3.7, 12), box), tmp_path / "out"
     with mock.patch.object(spillover_run, "prove", lambda _: proofs):
-        code, text, _ = run(capsys, "spillover", write(tmp_path), "--out", out, "--prove")
+        code, text, _ = run(capsys, "certify", write(tmp_path), "--out", out, "--prove")
     assert code == 1 and "passed" not in text
     wanted = "failed by an unstable machine in the box: stiffness x 0.95, 1 sample of extra delay"
     assert wanted in text and "on the plants: gain margin 2.88, 2 required" in text
@@ -545,14 +563,16 @@ def test_command_fails_a_design_with_an_unstable_machine_in_its_box(capsys, tmp_
 @pytest.mark.usefixtures("few", "undrawn")
 def test_a_certificate_is_written_whole_or_not_at_all(capsys, tmp_path):
     design, out = write(tmp_path), tmp_path / "out"
+    run(capsys, "certify", design, "--out", out)
+    (out / "report.html").unlink()
     (out / "report.html").mkdir(parents=True)
     (out / ".unfinished-killed").mkdir()
-    (out / "notes.txt").write_text("mine")
-    said = run(capsys, "spillover", design, "--out", out)[2]
+    (out / "certificate.json").unlink()
+    said = run(capsys, "certify", design, "--out", out, "--resume")[2]
     assert (
         said.startswith("studies: ") and "report.html: cannot write there, it is a folder" in said
     )
-    assert {path.name for path in out.iterdir()} == {"report.html", "notes.txt"}
+    assert not (out / "certificate.json").exists() and not (out / ".unfinished-killed").exists()
 
 
 @pytest.mark.parametrize(
@@ -567,5 +587,5 @@ def test_a_certificate_is_written_whole_or_not_at_all(capsys, tmp_path):
 )
 def test_what_cannot_be_judged_is_refused_in_words(capsys, tmp_path, study, more, message):
     design = write(tmp_path, **study)
-    said = refused(capsys, "spillover", design, "--out", tmp_path / "out", *more)
+    said = refused(capsys, "certify", design, "--out", tmp_path / "out", *more)
     assert message in said and not (tmp_path / "out").exists()

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from studies import Study, StudyError, load_study, paper_study, parse_study
+from studies import Study, StudyError
 from studies.reading import read_json
 from studies.study.explain import allowed_values
+from studies.study.spec import load_study, paper_study, parse_study
 from studies.study.template import STARTERS, starter_template, study_template, toml_value
 from studies.verify.prepared import prepared
 from tests.canonical import MACHINE, study_of

@@ -5,7 +5,7 @@ import pytest
 
 from studies.errors import StudyError
 from studies.sweeps.environments import environments_text, over_environments
-from studies.sweeps.say import say
+from studies.sweeps.say import report_of
 from studies.sweeps.show import best_cases, case_rows, is_ranked, margin_warning, ranked_cases
 from tests.studies.sweeps.test_sweep_tables import made_up, of_links, of_stations
 
@@ -75,7 +75,7 @@ def test_a_design_fails_in_one_environment():
     assert is_ranked(swept(codes=codes), "residual_rms")
     lost = swept(codes=[3, *codes[1:]])
     assert not is_ranked(lost, "residual_rms")
-    assert say(lost).result[0] == "no design has, in each of its environments, residual_rms"
+    assert report_of(lost).result[0] == "no design has, in each of its environments, residual_rms"
     assert ranked_cases(swept(), "residual_rms", "gain_margin > 2").tolist() == [1]
     with pytest.raises(StudyError, match="no design with status ok meets it in each of its env"):
         ranked_cases(swept(), "residual_rms", "gain_margin > 3.5")

@@ -1,4 +1,4 @@
-"""The commands of sweeps, in one process: sweep, dry run, show, best, plot, sensitivity, replay."""
+"""The commands of sweeps, in one process: sweep, dry run, show, best, plot, sensitivity, cases."""
 
 import dataclasses
 import json
@@ -24,7 +24,7 @@ from studies.show.pages import page as make_page
 from studies.study.consistency import patch_centers
 from studies.study.template import toml_value
 from studies.sweeps import explore
-from studies.sweeps.say import say
+from studies.sweeps.say import report_of
 from tests import canonical
 from tests.canonical import MACHINE
 from tests.pages import about, parsed, text_of, unpacked
@@ -103,7 +103,7 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
     code, text, _ = run(capsys, "sensitivity", out, "--by", "control_energy")
     assert code == 0 and "placement" in text and "first" in text
     code, text, _ = run(
-        capsys, "replay", out, "--case", "3", "--out", tmp_path / "run.h5", "--report"
+        capsys, "simulate", out, "--case", "3", "--out", tmp_path / "run.h5", "--report"
     )
     assert code == 0 and "largest relative difference of a metric" in text
     assert (tmp_path / "run.h5").stat().st_size > 10_000
@@ -117,8 +117,8 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
     assert load_design(out, f"id:{name}").study == load_design(out, int(number)).study
     design = load_design(out, int(number))
     assert re.fullmatch("[0-9a-f]{16}", design.case_id) and design.case_id.startswith(name)
-    assert "fits 40 cases" in refused(capsys, "replay", out, "--case", "id:")
-    assert "allowed: 0 to 39" in refused(capsys, "replay", out, "--case", "40")
+    assert "fits 40 cases" in refused(capsys, "simulate", out, "--case", "id:")
+    assert "allowed: 0 to 39" in refused(capsys, "simulate", out, "--case", "40")
     for options, name in (
         ((), "placement.png"),
         (("--x", "gain", "--hue", "drive.kp"), "points.pdf"),
@@ -162,14 +162,14 @@ def check_uncontrolled(capsys, spec, folder):
     file = folder / BASELINE
     kept = data.baseline["residual_rms"].data
     before, whole = file.stat().st_mtime_ns, file.read_bytes()
-    assert run(capsys, "sweep", spec, "--out", folder, "--resume", "--quiet") == (0, "", "")
+    assert run(capsys, "sweep", spec, "--out", folder, "--resume", "--no-progress") == (0, "", "")
     assert file.stat().st_mtime_ns == before
     file.write_bytes(whole[:999])
     assert "damaged; remove it and go on with --resume" in refused(capsys, "show", folder)
     file.unlink()
     text = run(capsys, "show", folder)[1]
     assert "best cases by residual_rms" in text and "without control" not in text
-    assert run(capsys, "sweep", spec, "--out", folder, "--resume", "--quiet") == (0, "", "")
+    assert run(capsys, "sweep", spec, "--out", folder, "--resume", "--no-progress") == (0, "", "")
     np.testing.assert_array_equal(read_sweep(folder).baseline["residual_rms"].data, kept)
 
 
@@ -249,7 +249,7 @@ def check_report(folder):
     def told(code):
         changed = {**data.variables, "status": data.variables["status"]._replace(data=code)}
         changed = dataclasses.replace(data, variables=changed)
-        return text_of(make_page(say(changed)))
+        return text_of(make_page(report_of(changed)))
 
     loud = int(np.sum(gain > 0.5))
     text = told(np.where(gain > 0.5, 4, 0))
@@ -276,7 +276,7 @@ def test_a_folder_of_other_things_does_not_hide_a_ready_study(tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     name = Path("paper_gains")
     ready = load_design(name)
-    name.mkdir()  # as left by studies spillover paper_gains --out paper_gains
+    name.mkdir()  # as left by studies certify paper_gains --out paper_gains
     (name / "report.html").write_text("-")
     assert load_design(name) == ready
     (name / "sweep.json").write_text("-")  # a sweep of that name is what is meant
@@ -290,11 +290,11 @@ def test_a_folder_of_other_things_does_not_hide_a_ready_study(tmp_path, monkeypa
         (("show", "nowhere"), "not the folder of a sweep"),
         (("best", "nowhere", "--by", "x"), "not the folder of a sweep"),
         (("plot", "nowhere"), "not the folder of a sweep"),
-        (("replay", "nowhere.toml"), "cannot be read"),
-        (("replay", "nowhere.toml", "--case", "1"), "leave --case out"),
+        (("simulate", "nowhere.toml"), "cannot be read"),
+        (("simulate", "nowhere.toml", "--case", "1"), "leave --case out"),
         (("sweep", "nowhere.toml", "--out", "x"), "cannot be read"),
         (
-            ("spillover", "papr", "--out", "x"),
+            ("certify", "papr", "--out", "x"),
             "papr: cannot be read (no such file); did you mean 'paper'?",
         ),
         (("sweep", "gains"), "--out: name a folder"),

@@ -24,7 +24,7 @@ from studies.results.labelled import Variable
 from studies.show.listing import Rows, print_rows
 from studies.show.pages import card, page
 from studies.show.report import Drawing
-from studies.single.run import Replay
+from studies.single.run import Simulation
 from studies.space.indices import elementary_effects, sobol_indices
 from studies.space.table import build_table
 from studies.study.margin import GUESSED
@@ -34,8 +34,7 @@ from studies.sweeps.environments import environments_text
 from studies.sweeps.explore import _figure
 from studies.sweeps.plots import MOST_LISTS, _scale_ordinate, front
 from studies.sweeps.run import make_plan
-from studies.sweeps.say import say
-from studies.sweeps.screening import check_screen, draw_screen
+from studies.sweeps.say import report_of
 from studies.sweeps.sensitivity import analyse, failure_causes
 from studies.sweeps.show import (
     best_cases,
@@ -329,13 +328,12 @@ def test_margins_are_shown_with_what_they_leave_out(capsys):
 
 
 def test_statuses_are_counted():
-    data = usual(codes=[0, 0, 0, 5, 5, 3, -1, -2])
+    data = usual(codes=[0, 0, 0, 5, 5, 3, -1, -1])
     assert status_rows(data).rows == [
         ["ok", "3", "37.5"],
         ["actuators saturated too often", "2", "25.0"],
+        ["not run yet", "2", "25.0"],
         ["diverged: bending beyond a tenth of the link", "1", "12.5"],
-        ["not run yet", "1", "12.5"],
-        ["left out by the screen", "1", "12.5"],
     ]
 
 
@@ -505,7 +503,7 @@ def test_cases_worse_than_no_control_are_marked(printed):
     text = printed(data, "best", "DIR", "--by", "residual_rms", "--count", "5")
     assert f"{told}\n" in text and note not in text
     assert f"{told}\n" in printed(data, "show", "DIR")
-    text = text_of(page(say(data)))
+    text = text_of(page(report_of(data)))
     assert f"; {told}." in text.partition("## ")[0] and f"\n{note}" in text
     assert "without control" not in printed(data, "best", "DIR", "--by", "gain_margin")
     for by, value in (("residual_rms[link=3]", "4 µm"), ("residual_rms[0][2]", "4 µm")):
@@ -540,7 +538,7 @@ def test_deflections_below_one_adc_step_are_not_ranked_in_silence(printed):
     assert text in printed(data, "best", "DIR", "--by", "residual_rms")
     shown = text.replace("2 of these 8 cases are", "1 of these 7 cases is")  # of the safe ones
     assert shown in printed(data, "show", "DIR")
-    assert text_of(page(say(data))).partition("## ")[0].count(shown) == 1
+    assert text_of(page(report_of(data))).partition("## ")[0].count(shown) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for by in ("-residual_rms", "gain_margin", "peak_voltage", "settling_time"):
@@ -656,7 +654,7 @@ def test_an_outlier_of_many_cases_is_counted_instead_of_shown():
 
 def test_the_head_of_a_report_says_what_the_data_say():
     data = usual(codes=[0, 0, 0, 0, 0, 0, 0, 4])
-    text = text_of(page(say(data)))
+    text = text_of(page(report_of(data)))
     head = text.partition("## ")[0]
     ranked = "best cases by residual_rms, smallest first, largest of all links and all stations"
     assert f"Which of 8 cases of control.gain_factor are the {ranked}, of those with" in head
@@ -665,7 +663,7 @@ def test_the_head_of_a_report_says_what_the_data_say():
     assert "the median of the ok cases is 4 µm." in head
     assert "case 4 with 2 µm (control.gain_factor = 0.5), gain margin 5 (14.0 dB);" in head
     assert '--by "residual_rms" --subject-to "gain_margin >= 2"' in head
-    assert "studies replay DIR --case 4 " in head and "studies spillover DIR --case 4 " in head
+    assert "studies simulate DIR --case 4 " in head and "studies certify DIR --case 4 " in head
     first = "Regardless of the margin, case 3 comes first, with 1 µm at a margin of 1.5 (3.5 dB)."
     assert first in text
     assert "by only" not in head and "CAUTION" not in text
@@ -673,7 +671,7 @@ def test_the_head_of_a_report_says_what_the_data_say():
 
 def test_the_tables_of_a_report_are_those_of_the_data():
     data = usual(codes=[0, 0, 0, 0, 0, 0, 0, 4])
-    found = tables_of(page(say(data)))
+    found = tables_of(page(report_of(data)))
     best = case_rows(data, np.array([4, 1, 6, 0, 5, 2]), ["residual_rms"])
     wanted = {
         "Best cases by residual_rms": best,
@@ -690,16 +688,16 @@ def test_the_tables_of_a_report_are_those_of_the_data():
 
 def test_a_report_names_what_does_not_tell_cases_apart():
     rms = of_stations(1e-6 * (1 + 1e-3 * np.arange(8)))
-    text = text_of(page(say(usual(residual_rms=rms))))
+    text = text_of(page(report_of(usual(residual_rms=rms))))
     # seven cases have a margin of 2, without the fourth
     assert "**The 7 best differ by only 0.7 %: residual_rms does not distinguish them; rank" in text
-    wide = text_of(page(say(usual(residual_rms=rms**30))))
+    wide = text_of(page(report_of(usual(residual_rms=rms**30))))
     assert "differ by only" not in wide
 
 
 def test_a_report_warns_where_no_margin_is_enough():
     data = usual(gain_margin=np.linspace(1.1, 1.8, 8))
-    text = text_of(page(say(data)))
+    text = text_of(page(report_of(data)))
     assert "**CAUTION: 8 of these 8 cases have a gain margin below 2 (smallest 1.1);" in text
     assert "case 3 with 1 µm (control.gain_factor = 0.4), gain margin 1.4 (2.9 dB);" in text
     ranked = "best cases by residual_rms, smallest first, largest of all links and all stations?"
@@ -709,13 +707,13 @@ def test_a_report_warns_where_no_margin_is_enough():
 def test_a_report_names_links_that_no_case_controls():
     rms = np.ones((2, 3, 3)) * 1e-6 * np.array([[[2.0], [5.0], [1.0]], [[1.0], [7.0], [3.0]]])
     data = made_up({"link_subsets": ["1", "1+3"]}, residual_rms=rms)
-    head = text_of(page(say(data))).partition("## ")[0]
+    head = text_of(page(report_of(data))).partition("## ")[0]
     assert "case 0 with 2 µm (link_subsets = 1); link 2, which no case controls: 5 µm;" in head
     assert "largest of links 1 and 3 and all stations" in head
 
 
 def test_a_card_shows_the_first_cases_of_the_report():
-    html = card(say(usual()))
+    html = card(report_of(usual()))
     rows = case_rows(usual(), np.array([4, 1, 6, 0, 7, 5]), ["residual_rms"]).rows
     (table,) = tables_of(f'<main>{html}<h2 id="versions">')[""]
     assert [*map(list, zip(*table.values(), strict=True))] == rows
@@ -727,17 +725,17 @@ def test_a_report_lacks_figures_that_have_nothing_to_draw_over(count):
     """Each list of placements of all links is another one."""
     axes = {"axes": {"placement": {"kind": "per_link"}}, "method": "random", "count": count}
     data = made_up(axes, residual_rms=of_stations(np.arange(1.0, count + 1)))
-    drawn = [part.name for part in say(data).parts if isinstance(part, Drawing)]
+    drawn = [part.name for part in report_of(data).parts if isinstance(part, Drawing)]
     assert drawn == ["machine", "cases"][: 2 - (count > MOST_LISTS)]
     same = usual(gain_margin=np.full(8, 3.0))
-    assert [x.name for x in say(same).parts if isinstance(x, Drawing)] == ["machine", "cases"]
+    assert [x.name for x in report_of(same).parts if isinstance(x, Drawing)] == ["machine", "cases"]
 
 
 def test_blocks_within_blocks_are_told():
     moved = {"method": "zip", "axes": {"drive.kp": [1e4, 2e4], "load.mass": [0.0, 0.1]}}
     axes = {"gain": [k / 20 for k in range(1, 17)]}
     data = made_up({"axes": axes, "blocks": [moved]}, residual_rms=np.ones((32, 3, 3)))
-    text = text_of(page(say(data)))
+    text = text_of(page(report_of(data)))
     assert "\nEvery combination of:\n" in text and ": 0.05, 0.1, " in text
     assert " 0.55, 0.6, ... (16 values).\n" in text
     assert "\n- Side by side `drive.kp`: 10000.0, 20000.0; `load.mass`: 0.0, 0.1.\n" in text
@@ -747,22 +745,9 @@ def test_blocks_within_blocks_are_told():
 def test_a_report_says_how_well_the_linear_model_ranks(correlation, is_poor):
     data = made_up({"axes": {"gain": GAINS}, "fidelity": "linear"}, residual_rms=of_stations(RMS))
     agreed = Agreement("residual_rms", 8, correlation, 2)
-    head = text_of(page(say(data, "DIR", agreed))).partition("**Question:**")[0]
+    head = text_of(page(report_of(data, agreed=agreed))).partition("**Question:**")[0]
     assert "**All runs are of the linear model** (`sweep.fidelity`); check the best cases" in head
     assert agreed.text in head and ("**too little to rank by**" in head) == is_poor
-
-
-def test_the_error_of_a_screen_is_a_share_of_the_full_model_s_value():
-    screen = {"by": "residual_rms", "keep": 1.0}
-    axes = {"axes": {"gain": GAINS}, "metrics": ["residual_rms"], "screen": screen}
-    half = {"screen_status": np.zeros(8, int), "screen_value": 0.5 * RMS}
-    data = made_up(axes, residual_rms=of_stations(RMS), **half)
-    text = check_screen(data).text
-    assert "On 8 random cases the linear model is off by 50 % in the median" in text
-    (axes,) = draw_screen(data).axes
-    for cases in axes.lines[:2]:  # random ones, and those that passed; in um
-        np.testing.assert_allclose(np.sort(cases.get_xdata()), np.sort(0.5e6 * RMS))
-        np.testing.assert_allclose(cases.get_ydata(), 2 * cases.get_xdata())
 
 
 def test_ties_keep_the_order_of_the_cases():
@@ -780,7 +765,6 @@ def test_ties_keep_the_order_of_the_cases():
         ({"by": "residual_rms[link=9]"}, r"sweep.by: .* \[link=1 to 3\]"),
         ({"by": "residual_rms[link=0]"}, r"sweep.by: .* \[link=1 to 3\], \[station=1 or more\]"),
         ({"by": "residual_rms[3]"}, r"sweep.by: .* residual_rms\[0 to 2\]\[0 or more\]"),
-        ({"screen": {"by": "residual_rms[link=9]"}}, r"sweep.screen.by: .* \[link=1 to 3\]"),
     ],
 )
 def test_an_entry_that_no_case_has_is_refused_as_the_file_is_read(sweep, words):
@@ -792,8 +776,7 @@ def test_an_entry_that_no_case_has_is_refused_as_the_file_is_read(sweep, words):
     "sweep",
     [
         {"by": "residual_modal_rms[mode=4]"},
-        {"screen": {"by": "residual_modal_rms[mode=4]"}},
-        {"screen": {"subject_to": "peak_voltage[link=4] < 1"}},
+        {"subject_to": "peak_voltage[link=4] < 1"},
     ],
 )
 def test_an_entry_that_no_case_has_is_refused_before_a_case_runs(sweep):
@@ -838,10 +821,10 @@ def test_what_of_a_folder_is_not_shown_is_said(tmp_path, capsys):
         code, _, text = run(capsys, command[0], folder, *command[1:])
         assert code == 0 and words in text and re.search(damaged, text)
     with pytest.warns(UserWarning, match="finished cases|damaged"):
-        loaded = studies.load(folder)
+        loaded = studies.load(folder).data
     assert words in loaded.attrs["notes"] and re.search(damaged, loaded.attrs["notes"])
     with pytest.warns(UserWarning, match="not of this sweep"):
-        studies.table(folder)
+        studies.load(folder).table()
 
 
 def test_a_replay_differs_in_any_number_that_was_kept(monkeypatch):
@@ -851,14 +834,14 @@ def test_a_replay_differs_in_any_number_that_was_kept(monkeypatch):
     numbers = dict(kept)
     monkeypatch.setattr(design, "_numbers", lambda run, names: numbers)
     run = SimpleNamespace(status=0)
-    assert Replay(run, 0, design.deviations(run, kept)).agrees
+    assert Simulation(run, 0, design.deviations(run, kept)).agrees
     for name, factor in (("gain_margin", 1.03), ("residual_rms", 2.0), ("disk_margin", np.nan)):
         numbers[name] = factor * kept[name]
-        again = Replay(run, 0, design.deviations(run, kept))
+        again = Simulation(run, 0, design.deviations(run, kept))
         assert not again.agrees and any(f"{name} differs by" in note for note in again.notes)
         numbers[name] = kept[name]
     numbers["bad_time"] = np.array(1e-3)
-    assert not Replay(run, 0, design.deviations(run, kept)).agrees
+    assert not Simulation(run, 0, design.deviations(run, kept)).agrees
     numbers |= {"bad_time": kept["bad_time"], "gain_margin": 1.01 * kept["gain_margin"]}
-    assert Replay(run, 0, design.deviations(run, kept)).agrees
-    assert not Replay(run, 3, {}).agrees
+    assert Simulation(run, 0, design.deviations(run, kept)).agrees
+    assert not Simulation(run, 3, {}).agrees

@@ -7,14 +7,14 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from rich.console import Console
 from scipy.stats import spearmanr
 
-from studies import cli
+from studies import cli, tune
 from studies.engine.results import read_sweep
 from studies.engine.runs import run_study
 from studies.errors import StudyError
-from studies.explore import explore_results
+from studies.explore import explore
+from studies.job import working
 from studies.results.labelled import Variables
 from studies.show.pages import page
 from studies.space.spec import parse_sweep
@@ -22,7 +22,6 @@ from studies.store import read_store
 from studies.study import spec as spec_module
 from studies.study.files import read_toml
 from studies.study.spec import load_study
-from studies.sweeps.run import run_sweep
 from studies.sweeps.show import ranked_cases
 from studies.tuning import audit as audit_module
 from studies.tuning import results
@@ -32,15 +31,15 @@ from studies.tuning.audit import Disagreement
 from studies.tuning.check import JudgedDesign, OwnRun
 from studies.tuning.evaluate import Evaluation, Evaluator
 from studies.tuning.findings import TuneFindings, best_family
-from studies.tuning.folder import open_tuning
+from studies.tuning.folder import CHECKED, PROGRESS, fixed_part, load_progress
 from studies.tuning.loop_figures import DesignFigures
 from studies.tuning.objective import objective_of
 from studies.tuning.optimise import begin, is_compatible
-from studies.tuning.run import run_tuning
 from studies.tuning.say import n_outside, rank_correlation, say
 from studies.tuning.spec import load_tuning
 from tests.bare import paper_study, parse_tuning
 from tests.pages import about, parsed, text_of
+from tests.sweeps import run_sweep
 from tests.tunings import GAIN, SMALL, tuning
 
 FILE = """
@@ -145,7 +144,7 @@ def check_report(out):
 
 def check_explorer(out):
     """Its page tells when the folder has been begun with another file since."""
-    said = about(explore_results(out).read_text(encoding="utf-8"))
+    said = about(explore(out, progress=False).folder.read_text(encoding="utf-8"))
     assert said["free"] == "control.gain_factor, placement[0][0], placement[0][1], placement[0][2]"
     assert said["starting points"] == "8 starting points: 8 descended"
     manifest = out / "tune.json"
@@ -153,7 +152,7 @@ def check_explorer(out):
     stale = "is of another tuning file than"
     assert stale not in (out / "explorer.html").read_text(encoding="utf-8")
     manifest.write_text(before.replace('"iterations": 3', '"iterations": 7'))
-    assert stale in explore_results(out).read_text(encoding="utf-8")
+    assert stale in explore(out, progress=False).folder.read_text(encoding="utf-8")
     manifest.write_text(before)
 
 
@@ -166,7 +165,7 @@ def test_a_baseline_without_a_stable_loop_is_refused(tmp_path, capsys):
     )
     file.write_text(text.replace("ratios =", "velocity_gain = [3e3, 3e3, 3e3], ratios ="))
     with pytest.raises(SystemExit, match="2"):
-        cli.main(["tune", str(file), "--out", str(tmp_path / "out"), "--quiet"])
+        cli.main(["tune", str(file), "--out", str(tmp_path / "out"), "--no-progress"])
     message = capsys.readouterr().err
     assert "tune.objective.spillover: the loop of the baseline is unstable on machine 1" in message
     assert "1/s; allowed: > 0 on every machine" in message and "Traceback" not in message
@@ -362,7 +361,7 @@ def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
     check_report(out)
     check_explorer(out)
     before, _ = read_store(out / "tune.h5")
-    cli.main(["tune", str(file), "--out", str(out), "--resume", "--quiet"])
+    cli.main(["tune", str(file), "--out", str(out), "--resume", "--no-progress"])
     after, _ = read_store(out / "tune.h5")
     assert set(before) == set(after)
     for name, variable in before.items():
@@ -370,7 +369,7 @@ def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
     cli.main(["tune", str(file), "--audit"])  # exits with 1 where derivatives are wrong
     assert "below 0.0001" in capsys.readouterr().out
     file.write_text(FILE.replace("iterations = 3", "iterations = 4"))
-    cli.main(["tune", str(file), "--out", str(out), "--resume", "--quiet"])
+    cli.main(["tune", str(file), "--out", str(out), "--resume", "--no-progress"])
     assert read_store(out / "tune.h5")[0]["trial_objective"].data.shape == (4, 8)
     file.write_text(FILE.replace("starts = 2", "starts = 3"))
     for more, message in (
@@ -391,7 +390,7 @@ def test_placement_by_gradient_is_as_good_as_the_sweep(tmp_path):
     asked = read_toml(specs / "placement.toml")
     for section in ("run", "link", "motion", "shaper", "drive", "metrics"):
         assert spec.data.get(section) == asked.get(section)
-    swept = run_sweep(parse_sweep(asked), tmp_path / "sweep", is_quiet=True)
+    swept = run_sweep(parse_sweep(asked), tmp_path / "sweep")
     data = read_sweep(tmp_path / "sweep")
     best = ranked_cases(data, "residual_rms", "gain_margin >= 2", 15)
     residual = np.max(data["residual_rms"], axis=(1, 2))
@@ -404,7 +403,7 @@ def test_placement_by_gradient_is_as_good_as_the_sweep(tmp_path):
     # the question discriminates: among the best 15 of 4,096, and against the middle of what is safe
     assert residual[best].max() > 1.1 * residual[best].min()
     assert np.median(residual[safe]) > 2 * residual[best].min()
-    found = run_tuning(spec, tmp_path / "tune", False, Console(quiet=True), True)
+    found = tune(spec, tmp_path / "tune", progress=False)
     tuned = run_study(load_study(tmp_path / "tune" / "tuned.toml"), has_record=False)
     assert tuned.status == 0 and tuned.loop.gain_margin >= 2 * (1 - 1e-3)
     # one of 4,096 may be a little better than where 16 descents end
@@ -419,9 +418,9 @@ def test_placement_by_gradient_is_as_good_as_the_sweep(tmp_path):
 
 
 def opened(out, is_resumed, **other):
-    manifest = {"spec": {"tune": {"iterations": 3}}, "code": "a", "jaxlib": "1", "precision": "x"}
-    with open_tuning(out, manifest | other, is_resumed) as before:
-        return before
+    request = {"spec": {"tune": {"iterations": 3}}, "code": "a", "jaxlib": "1", "precision": "x"}
+    with working("tune", out, request | other, (), is_resumed, False, CHECKED, fixed_part):
+        return load_progress(out / PROGRESS)
 
 
 def test_a_folder_of_other_things_is_left_alone(tmp_path):
@@ -473,9 +472,8 @@ def test_damaged_files_are_named(tmp_path, name, content):
 
 
 def test_a_tuning_that_fails_at_once_leaves_the_folder_free(tmp_path):
-    manifest = {"spec": {}, "code": "a", "jaxlib": "1", "precision": "x"}
     refused = pytest.raises(StudyError, match="nothing depends")
-    with refused, open_tuning(tmp_path, manifest, False):
+    with refused, working("tune", tmp_path, {}, (), progress=False):
         raise StudyError("nothing depends on it")
     assert opened(tmp_path, False) is None
 

@@ -1,6 +1,5 @@
 """What a tuning has found stands in its folder at once; no phase runs twice; figures cost none."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -12,33 +11,30 @@ from unittest import mock
 import jax
 import numpy as np
 import pytest
-from rich.console import Console
 
 from studies.engine.design import load_design
 from studies.errors import DataWarning, FigureWarning, StudyError
+from studies.job import working
 from studies.show import figures
 from studies.study.files import is_as_written
 from studies.study.spec import load_study
 from studies.tuning import audit as audit_module
-from studies.tuning import phases as phases_module
 from studies.tuning import plots
 from studies.tuning import run as tuning_run
 from studies.tuning.audit import Disagreement
 from studies.tuning.check import JudgedDesign, OwnRun
 from studies.tuning.folder import load_progress
 from studies.tuning.loop_figures import DesignFigures
-from studies.tuning.phases import KeptPhases
 from studies.tuning.references import GainScan, References
-from studies.tuning.run import run_tuning
+from studies.tuning.run import tune_phases, tune_request, tuned_into
+from tests.jobs import quiet_job
 from tests.studies.tuning.test_tuning import Known
 from tests.tunings import EVERY_KIND, GAIN, SMALL, tuning
 
-SILENT = Console(file=open(os.devnull, "w"))  # noqa: SIM115
 
-
-def known():
+def known(iterations=4):
     """A tuning of the small machine's gain, by a function in place of its runs."""
-    spec = tuning(GAIN, starts=1, iterations=4, method="adam")
+    spec = tuning(GAIN, starts=1, iterations=iterations, method="adam")
     evaluator = Known(spec, lambda x: (x[0] - 0.3) ** 2 + 0.1)
     evaluator.lanes = 2
     return spec, evaluator
@@ -78,7 +74,8 @@ def with_phases(check=None, audit=None, write=None):
 
 def tune(out, is_resumed=False):
     spec, evaluator = known()
-    return run_tuning(spec, out, is_resumed, SILENT, True, evaluator=evaluator)
+    with working("tune", out, tune_request(spec), tune_phases(spec), is_resumed, False) as job:
+        return tuned_into(spec, job, evaluator=evaluator)
 
 
 def interrupted(after):
@@ -132,23 +129,25 @@ def test_phases_that_have_ended_are_not_repeated(tmp_path):
         for name, value in wanted.items():
             jax.tree.map(np.testing.assert_array_equal, getattr(found, name), value)
     assert type(again.judged[0].own_run) is OwnRun
-    arrays = dict(np.load(out / phases_module.FILE))
-    np.savez(out / phases_module.FILE, **arrays | {"x3": arrays["x3"] * 1.5})
+    file = out / "parts" / "check.npz"
+    arrays = dict(np.load(file))
+    np.savez(file, **arrays | {"x3": arrays["x3"] * 1.5})
     with with_phases(check):
         tune(out, True)
-    (out / phases_module.FILE).write_bytes(b"damaged")
+    file.write_bytes(b"damaged")
     with with_phases(check):
         tune(out, True)
     assert calls == ["check"] * 3
 
 
-def test_phases_of_another_end_are_not_used(tmp_path):
+def test_parts_of_another_end_are_not_used(tmp_path):
     """A descent that goes on ends elsewhere."""
-    at = SimpleNamespace(best_place=np.ones((2, 2)), iteration=np.array(3))
-    assert KeptPhases(tmp_path, at).find("check", lambda: 1.5) == 1.5
-    assert KeptPhases(tmp_path, at).find("check", lambda: 2.5) == 1.5
-    at.iteration = np.array(4)
-    assert KeptPhases(tmp_path, at).find("check", lambda: [2.5, None, "x"]) == [2.5, None, "x"]
+    with with_phases():
+        tune(tmp_path / "out")
+    calls, (spec, evaluator) = [], known(5)
+    with with_phases(lambda *_: calls.append("check") or FOUND["check"]):
+        tuned_into(spec, quiet_job(tmp_path / "out", tune_phases(spec)), evaluator=evaluator)
+    assert calls
 
 
 def test_a_tenth_of_the_evaluations_checks_derivatives():
@@ -223,7 +222,7 @@ def test_a_tuning_killed_at_random_moments_keeps_its_best_design(tmp_path):
     (tmp_path / "gain.toml").write_text(toml_text(data))
     out, random = tmp_path / "out", np.random.default_rng(5)
     command = [sys.executable, "-m", "studies.cli", "tune", str(tmp_path / "gain.toml")]
-    command += ["--out", str(out), "--resume", "--quiet"]
+    command += ["--out", str(out), "--resume", "--no-progress"]
     kills = 0
     for wait in random.uniform(4.0, 40.0, 5):
         process = subprocess.Popen(command)

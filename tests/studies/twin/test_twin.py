@@ -18,13 +18,11 @@ from jaxmodel.beam import BASES, by_link
 from jaxmodel.piezo import actuator_constant, sensor_constant
 from jaxmodel.static import static_bending
 from jaxmodel.stretch import find_stretch
-from studies.bench.works import BARE
 from studies.documents import schema
-from studies.engine.design import Design
 from studies.engine.preflight import check_run
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
-from studies.reference.tables import frequencies
+from studies.reference.tables import BARE, frequencies
 from studies.results.document import json_text
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study
@@ -39,7 +37,8 @@ from studies.twin.multibody import Settings, build_model
 from studies.twin.plan import SignalPath
 from studies.twin.reading import Reader
 from studies.twin.ringing import ringing_poles
-from studies.twin.run import twin_design
+from studies.twin.verb import twin
+from tests.jobs import quiet_job
 from tests.studies.test_cli import refused, run
 
 HOME = np.array([0.0, 0.0, np.pi / 6])
@@ -499,9 +498,9 @@ def test_each_change_has_the_differences_without_and_with_control(monkeypatch, s
 
 def test_the_command_writes_report_figure_and_numbers(tmp_path, capsys, monkeypatch):
     needs_exudyn()
-    design = Design(Study().change(**SHORT), {})
+    study, job = Study().change(**SHORT), quiet_job(tmp_path, twin_run.PHASES)
     settings = STIFF._replace(n_elements=10, n_steps=8)
-    result = twin_design(design, tmp_path, settings=settings, has_changes=False)
+    result = twin_run.compared_with_twin(study, job, settings, has_changes=False)
     document = json.loads((tmp_path / "twin.json").read_text())
     jsonschema.validate(document, schema("twin"))
     assert document == json.loads(json_text(say.twin_document(result)))
@@ -512,7 +511,7 @@ def test_the_command_writes_report_figure_and_numbers(tmp_path, capsys, monkeypa
     page = (tmp_path / "report.html").read_text()
     assert "mid-span deflection, link 1, with control" in page and "data:image/png" in page
 
-    monkeypatch.setattr(twin_run, "twin_design", lambda *_: result)
+    monkeypatch.setattr(twin_run, "compared_with_twin", lambda *_: result)
     capsys.readouterr()
     assert json.loads(run(capsys, "twin", "paper", "--json")[1]) == document
     code, printed, _ = run(capsys, "twin", "paper")
@@ -542,7 +541,7 @@ THREE = {
 def test_the_square_is_the_same_in_both_models(fields, deflection, voltage, tmp_path):
     needs_exudyn()
     study = Study().change(run__duration=0.5, metrics__residual_length=0.1, **fields)
-    result = twin_design(Design(study, {}), tmp_path)
+    result = twin(study, tmp_path, progress=False)
     changes = {one.text: one for one in result.causes}
     found = changes["as they are"]
     assert found.controlled < deflection and found.voltage < voltage

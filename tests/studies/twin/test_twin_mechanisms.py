@@ -13,7 +13,6 @@ from jaxmodel.linear import linearise, natural_modes
 from jaxmodel.mechanisms.carriers import Rail
 from jaxmodel.prepare import prepare
 from jaxmodel.simulate import simulate
-from studies.engine.design import Design
 from studies.twin import compare
 from studies.twin.chain import close_chain, lever
 from studies.twin.loop import run_twin
@@ -21,7 +20,7 @@ from studies.twin.machine import describe_machine
 from studies.twin.multibody import Settings, build_model
 from studies.twin.plan import plan_run
 from studies.twin.plots import side_by_side
-from studies.twin.run import twin_design
+from studies.twin.verb import twin
 from tests.bare import parse_study
 from tests.jaxmodel.test_mechanisms import MACHINES, POSES, case_of
 from tests.studies.twin.test_twin import EVERYTHING, SHORT, STIFF, differences, needs_exudyn
@@ -285,7 +284,7 @@ def test_the_square_of_a_3_rrr_is_the_same_in_both_models(tmp_path):
             "metrics": {"residual_length": 0.1},
         }
     )
-    result = twin_design(Design(study, {}), tmp_path)
+    result = twin(study, tmp_path, progress=False)
     changes = {one.text: one for one in result.causes}
     found = changes["as they are"]
     assert found.controlled < 3.5e-3 and found.voltage < 6e-3

@@ -19,12 +19,14 @@ from jaxmodel.shaper import SHAPERS, Impulses
 from studies import passport
 from studies.documents import schema
 from studies.reference import tables
+from studies.show.report import print_report
 from studies.study import spec
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import load_study
-from studies.verify import commands, links, loops, machine, outside, run, stepping, trajectories
+from studies.verify import links, loops, machine, outside, run, stepping, trajectories
 from studies.verify.prepared import prepared
 from studies.verify.rows import Assumption, largest, worst, worst_relative
+from studies.verify.verb import verify
 from tests import TOP
 from tests.bare import paper_study, parse_study
 from tests.canonical import TINY, study_of, with_sections
@@ -237,7 +239,7 @@ _CHECK = """
 import json, sys
 from studies.config import start
 start()
-from studies.bench.works import BARE
+from studies.reference.tables import BARE
 from studies.study.spec import parse_study
 from studies.verify.run import CHECKS
 machine = {
@@ -427,8 +429,8 @@ def test_figures_of_others_hold_whatever_the_study(check, count):
     ids=["pinned_free", "loaded", "ideal", "friction", "locked"],
 )
 def test_other_studies_pass(sections):
-    found = run.verify_study(parse_study(sections))
-    assert found.is_passed, [row for row in found.rows if not row.is_passed]
+    found = verify(parse_study(sections), progress=False)
+    assert found.is_good, [row for row in found.rows if not row.is_passed]
 
 
 # --- table, documents, exit code ------------------------------------------------------------------
@@ -526,6 +528,7 @@ def checks(monkeypatch, tmp_path):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
     chosen = {"one": lambda _: [row(1e-4), row(0.0, left_out="nothing there")]}
     monkeypatch.setattr(run, "CHECKS", chosen)
+    monkeypatch.setattr(run, "PHASES", {"one": 1.0, "two": 1.0})
     return chosen
 
 
@@ -551,16 +554,30 @@ def test_the_command(checks, capsys, tmp_path):
     assert passport.find(heavy.model_copy(update={"title": "heavy"})).failed == ("x",)
 
 
-@pytest.mark.parametrize(("width", "columns"), [(60, 4), (80, 5), (120, 6)])
-def test_the_table_fits_the_terminal(checks, capsys, width, columns):
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_the_table_fits_the_terminal(checks, capsys, width):
     word = "pinned_pinned"
     checks["one"] = lambda _: [row(1e-4).replace(assumption=f"links ({word})", against=word)]
-    console = Console(width=width)
-    commands._print(run.verify_study(), console)
-    table, text = capsys.readouterr().out.split("└")
+    print_report(verify(progress=False).report(), Console(width=width))
+    text, table = capsys.readouterr().out.split("┏")
     assert f"({word})" in table and "…" not in table and "1 of 1" in text
-    lines = table.splitlines()
-    assert max(map(len, lines)) <= width and lines[3].count("│") == columns + 1
+    assert max(map(len, table.splitlines())) <= width and "1.0e-04" in table and "1e-03" in table
+
+
+def test_a_verification_goes_on_where_it_was_interrupted(checks, capsys, tmp_path):
+    calls, one = [], checks["one"]
+    checks["one"] = lambda study: calls.append("one") or one(study)
+    checks["two"] = mock.Mock(side_effect=[KeyboardInterrupt, [row(0.5)], AssertionError])
+    arguments = ("verify", "--out", tmp_path / "out")
+    code, _, said = call(capsys, *arguments)
+    assert (
+        code == 130 and f"continue with: studies verify --out {tmp_path / 'out'} --resume" in said
+    )
+    assert "holds a verification already" in call(capsys, *arguments)[2]
+    documents = [call(capsys, *arguments, "--resume", "--json") for _ in range(2)]
+    assert [code for code, *_ in documents] == [1, 1] and documents[0] == documents[1]
+    assert [x["difference"] for x in json.loads(documents[0][1])["rows"]] == [1e-4, 0.0, 0.5]
+    assert calls == ["one"]
 
 
 def test_a_check_that_cannot_run_fails(checks, capsys):

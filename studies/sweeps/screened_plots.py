@@ -1,4 +1,4 @@
-"""Figures of a screen: how the metric is distributed, and what each axis does to it."""
+"""Figures of designs of which some are kept: how the metric is distributed, by axes as well."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from jaxmodel.metrics import METRICS
 from studies.engine.results import SweepData
 from studies.results.labelled import Variable
-from studies.screen.run import ScreenOutcome
+from studies.screen.run import ScreenOutcome, chosen
 from studies.screen.shards import ScreenRequest
 from studies.screen.tally import BUCKETS, GROWTH, LEAST, quantile
 from studies.show import figures
@@ -38,10 +38,14 @@ def entry_unit(screen: ScreenRequest) -> str:
     return unit_of_metric(described(screen), screen.entry)
 
 
-def values(done: ScreenOutcome) -> Figure:
+def values(done: ScreenOutcome, uncontrolled: float | None) -> Figure:
     """Designs that ended well by value, unstable ones included.
 
     Line: the last one that was kept; dashed: the baseline without control, if it was run.
+
+    Args:
+        done: how the screen ended.
+        uncontrolled: what the designs are ranked by without control; None: not known.
     """
     counts = done.tally.sketch[0]
     unit = entry_unit(done.screen)
@@ -58,8 +62,8 @@ def values(done: ScreenOutcome) -> Figure:
         alpha=0.6,
     )
     for value, color, style in (
-        (_last_kept(done), figures.SERIES[1], "-"),
-        (done.uncontrolled, figures.SERIES[4], "--"),
+        (chosen(done).kept_value[-1], figures.SERIES[1], "-"),
+        (uncontrolled, figures.SERIES[4], "--"),
     ):
         if value is not None:
             at = factor * np.clip(value, LEAST, LEAST * GROWTH**BUCKETS)
@@ -69,10 +73,6 @@ def values(done: ScreenOutcome) -> Figure:
     if counts[part].max() > 100:
         axes.set_yscale("log")
     return figure
-
-
-def _last_kept(done: ScreenOutcome) -> float | None:
-    return float(done.selection.kept_value[-1]) if done.selection and done.n_kept else None
 
 
 def axis_head(name: str) -> str:

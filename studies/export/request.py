@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,11 +24,11 @@ from studies.export.fixed import FixedPoint, rail_samples
 from studies.export.fixed_blocks import FixedBlocks
 from studies.export.in_the_loop import LoopRun
 from studies.export.verify import Verification, reference_run
-from studies.publish import shown
+from studies.result import Result
 from studies.study.labels import describe
 
 
-class Job(NamedTuple):
+class Export(NamedTuple):
     """What to export, and how."""
 
     exported: FixedController
@@ -52,7 +53,8 @@ class ExportResult(NamedTuple):
     on_target: OnTarget | None = None
 
 
-class Exported(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Exported(Result):
     """An export."""
 
     controller: FixedController
@@ -76,8 +78,8 @@ class Exported(NamedTuple):
         """Whether a comparison failed: then the controller is not written."""
         return self.verified is not None and self.verified.has_failed
 
-    def _repr_html_(self) -> str:
-        return shown(self)
+    def told(self) -> list[str]:
+        return [f"written: {file}" for file in self.files]
 
 
 def check_loop(
@@ -109,7 +111,7 @@ def check_loop(
     return loop
 
 
-def reference_motion(job: Job) -> LoopRun:
+def reference_motion(job: Export) -> LoopRun:
     """The case's motion with the JAX controller; it must finish."""
     exported = job.exported
     job.console.print(f"in the loop: {exported.structure.n_steps} samples for each controller")
