@@ -55,7 +55,7 @@ def report_of(result: Any) -> Report:
 
 
 def card(result: Any) -> str:
-    """A result of a type in SAY as HTML, whose texts are shown as they are."""
+    """A result as HTML, whose texts are shown as they are."""
     from studies.show import pages  # loads Matplotlib
 
-    return pages.card(report_of(result))
+    return pages.card(result.report())

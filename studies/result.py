@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
-from studies.publish import REPORT
 from studies.results.labelled import Labelled, Variable, document, told, variables
 from studies.store import variable_labels, with_coordinates
 
@@ -22,6 +22,8 @@ class Result:
 
     #: Where its files are; None: nothing was written.
     folder: Path | None = None
+    #: The page of its report; None: there is none.
+    report_page: Path | None = None
     #: What else is there, for the line that names the report.
     FILES: ClassVar[str] = ""
 
@@ -60,9 +62,9 @@ class Result:
 
     def told(self) -> list[str]:
         """What files there are, in lines."""
-        if self.folder is None or self.folder.is_dir():
-            return [f"report: {self.folder / REPORT}{self.FILES}"] if self.folder else []
-        return [f"written: {self.folder}"]
+        is_file = self.folder is not None and not self.folder.is_dir()
+        lines = [f"written: {self.folder}"] if is_file else []
+        return [*lines, *([f"report: {self.report_page}{self.FILES}"] if self.report_page else [])]
 
     @property
     def data(self) -> xarray.Dataset:
@@ -83,10 +85,12 @@ class Result:
         return pandas.DataFrame({"value": whole})
 
     def report(self) -> Any:
-        """What is told of it, a `studies.show.report.Report`.
+        """What is told of it, a `studies.show.report.Report`: the same for page and console."""
+        return self._report
 
-        Made by modules found by name: they know results, which do not need them.
-        """
+    @cached_property
+    def _report(self) -> Any:
+        """Made by modules found by name: they know results, which do not need them."""
         return import_module("studies.cards").report_of(self)
 
     def plot(self, name: str = "") -> Any:
@@ -110,7 +114,8 @@ def _is_rows(value: Any) -> bool:
     return isinstance(value, list) and bool(value) and isinstance(value[0], dict)
 
 
-def in_folder(result: R, folder: Path | None) -> R:
-    """The same result, which knows where its files are."""
+def in_folder(result: R, folder: Path | None, page: Path | None = None) -> R:
+    """The same result, which knows where its files and the page of its report are."""
     object.__setattr__(result, "folder", folder)
+    object.__setattr__(result, "report_page", page)
     return result

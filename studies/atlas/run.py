@@ -14,7 +14,6 @@ from jaxmodel import status
 from studies.atlas.attribution import interaction, shapley
 from studies.atlas.figures import write_animation
 from studies.atlas.findings import AtlasFindings, adc_step, evaluate_atlas
-from studies.atlas.say import say
 from studies.atlas.subsets import (
     CHOICES,
     MATTERS,
@@ -33,7 +32,7 @@ from studies.engine.columns import axis_variables, named
 from studies.engine.run_data import run_attributes
 from studies.errors import StudyError
 from studies.job import Job
-from studies.publish import publish
+from studies.publish import REPORT, publish
 from studies.result import in_folder
 from studies.results.labelled import Variable, Variables, variables
 from studies.show.pages import write_report
@@ -85,8 +84,8 @@ def mapped(study: Study, job: Job, has_pdf: bool = False) -> AtlasFindings:
     with publish(job.place, of_modes) as staging:
         write_store(staging / DATA, atlas_variables(found), run_attributes(study))
         write_animation(found, staging)
-        write_report(say(found), staging, has_pdf)
-    return in_folder(found, job.place)
+        write_report(found.report(), staging, has_pdf)
+    return in_folder(found, job.place, job.place / REPORT)
 
 
 def _swept(study: Study, job: Job, name: str, **which: Any) -> tuple[Subsets, list[str]]:

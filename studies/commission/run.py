@@ -12,7 +12,6 @@ import numpy as np
 
 from studies.commission.findings import CommissionFindings
 from studies.commission.machines import margins_on
-from studies.commission.say import say
 from studies.commission.spec import MeasuredSpec
 from studies.commission.stages import (
     STAGES,
@@ -29,7 +28,7 @@ from studies.commission.stages import (
 )
 from studies.errors import StudyError
 from studies.job import Job
-from studies.publish import publish
+from studies.publish import REPORT, publish
 from studies.result import in_folder
 from studies.results.document import json_text
 from studies.show.pages import write_report
@@ -62,8 +61,8 @@ def commissioned(measured: MeasuredSpec, job: Job) -> CommissionFindings:
             break
     with publish(out) as staging:
         (staging / DOCUMENT).write_text(json_text(outcome), encoding="utf-8")
-        write_report(say(outcome), staging)
-    return in_folder(outcome, out)
+        write_report(outcome.report(), staging)
+    return in_folder(outcome, out, out / REPORT)
 
 
 def _run(stage: Stage, measured: MeasuredSpec, job: Job) -> str:

@@ -75,7 +75,6 @@ class ComparedVariants(Labelled, Result, command="comparison", version=2):
     arithmetics and at several sample rates.
     """
 
-    out: Path = unwritten()
     study: Study = unwritten()
     motion: str = told("why it is not that of the study; empty if it is")
     board: Board | None = unwritten()
@@ -95,9 +94,6 @@ class ComparedVariants(Labelled, Result, command="comparison", version=2):
     def is_good(self) -> bool:
         """Whether any variant has a controller."""
         return not all(x.fault for x in self.variants)
-
-    def told(self) -> list[str]:
-        return [f"report: {self.out / PAGE}"]
 
 
 def compare_variants(
@@ -140,7 +136,6 @@ def compare_variants(
             console.print(": ".join((f"{rate:g} Hz, {variant.arithmetic}", _verdict(variant))))
             variants.append(variant)
     found = ComparedVariants(
-        out=out,
         study=design.study,
         motion=motion.text,
         board=board,
@@ -149,9 +144,9 @@ def compare_variants(
         uncontrolled=uncontrolled,
     )
     with publish(out) as staging:
-        (staging / PAGE).write_text(whole_page(say(found)), encoding="utf-8")
+        (staging / PAGE).write_text(whole_page(found.report()), encoding="utf-8")
         (staging / DOCUMENT).write_text(json_text(found), encoding="utf-8")
-    return in_folder(found, out)
+    return in_folder(found, out, out / PAGE)
 
 
 def _uncontrolled(study: Study) -> float:

@@ -18,7 +18,7 @@ from studies.export.document import study_hash
 from studies.export.firmware.boards import BOARDS, Board
 from studies.export.firmware.build import check_tools
 from studies.export.request import Export, Exported, ExportResult
-from studies.export.say import say, whole_page
+from studies.export.say import whole_page
 from studies.export.targets import TARGETS
 from studies.publish import publish
 from studies.result import in_folder
@@ -107,7 +107,7 @@ def export_design(
     # files of an earlier export stay unchanged
     texts = {} if made.has_failed else result.files
     if made.verified is not None:
-        texts |= {FAILED if made.has_failed else REPORT: whole_page(say(made))}
+        texts |= {FAILED if made.has_failed else REPORT: whole_page(made.report())}
     with publish(out, stale=() if made.has_failed else (REPORT, FAILED)) as staging:
         for file, text in texts.items():
             (staging / file).write_text(text, encoding="utf-8")

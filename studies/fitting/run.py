@@ -9,7 +9,6 @@ from studies.engine.run_data import run_attributes
 from studies.fitting import plots
 from studies.fitting.document import fit_document, fit_variables
 from studies.fitting.estimate import Fitted, estimate, suggest
-from studies.fitting.say import say
 from studies.fitting.spec import FitSpec
 from studies.fitting.statistics import REGION
 from studies.job import Job
@@ -56,12 +55,12 @@ def fitted_into(spec: FitSpec, job: Job, has_pdf: bool = False) -> Fitted:
             (staging / STUDY).write_text(study_template(fitted.study), encoding="utf-8")
             (staging / TUNE).write_text(_tuning(fitted), encoding="utf-8")
             write_store(staging / DATA, fit_variables(fitted), run_attributes(fitted.study))
-            write_report(say(fitted), staging, has_pdf)
+            write_report(fitted.report(), staging, has_pdf)
         fitted = suggest(fitted, job)
         with publish(out) as staging:  # only now is there a document: the answer is complete
-            (staging / REPORT).write_text(page(say(fitted), out), encoding="utf-8")
+            (staging / REPORT).write_text(page(fitted.report(), out), encoding="utf-8")
             (staging / DOCUMENT).write_text(json_text(fit_document(fitted)), encoding="utf-8")
-    return in_folder(fitted, out)
+    return in_folder(fitted, out, out / REPORT)
 
 
 def machines(fitted: Fitted) -> dict[str, list[float]]:

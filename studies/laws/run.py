@@ -29,9 +29,8 @@ from studies.laws.findings import (
 )
 from studies.laws.judging import judging_sweep, read_judged
 from studies.laws.machines import machines_of, with_noise
-from studies.laws.say import say
 from studies.laws.tuning import Budget, Tuned, descend, make_budget, tune_candidate, tune_on_workers
-from studies.publish import publish
+from studies.publish import REPORT, publish
 from studies.result import in_folder
 from studies.results.document import json_text
 from studies.show.pages import write_report
@@ -123,7 +122,7 @@ def compared(
     findings = find(study, budget, tuned, judged, entries)
     job.begin("draw")
     _write(findings, job.place)
-    return in_folder(findings, job.place)
+    return in_folder(findings, job.place, job.place / REPORT)
 
 
 def _tune(study: Study, budget: Budget, job: Job, remote: Remote | None) -> list[Tuned]:
@@ -172,4 +171,4 @@ def _write(findings: LawFindings, out: Path) -> None:
             named = controller.study.model_copy(update={"title": title})
             file.write_text(study_template(named), encoding="utf-8")
         (staging / DOCUMENT).write_text(json_text(laws_document(findings)), encoding="utf-8")
-        write_report(say(findings), staging)
+        write_report(findings.report(), staging)

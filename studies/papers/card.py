@@ -67,7 +67,7 @@ class CardResult(Result):
     outcome: PaperOutcome
     study: Study  # baseline
     tables: dict[str, Rows]  # by name of their CSV file
-    page: Report
+    made: Report
     # runs by name of their HDF5 file: their study and variables
     stores: Mapping[str, tuple[Study, dict[str, Variable]]] = field(default_factory=dict)
 
@@ -75,7 +75,7 @@ class CardResult(Result):
         return self.outcome
 
     def report(self) -> Report:
-        return self.page
+        return self.made
 
     def variables(self) -> dict[str, Variable]:
         return dict(next(iter(self.stores.values()))[1])

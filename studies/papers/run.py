@@ -8,7 +8,7 @@ from pathlib import Path
 from studies.engine.run_data import run_attributes
 from studies.job import Job
 from studies.papers.card import CardResult, PaperCard
-from studies.publish import publish
+from studies.publish import REPORT, publish
 from studies.result import in_folder
 from studies.results.document import json_text
 from studies.show.listing import Rows
@@ -40,8 +40,8 @@ def examined(card: PaperCard, job: Job, has_pdf: bool = False) -> CardResult:
         for name, rows in result.tables.items():
             _write_csv(staging / f"{name}.csv", rows)
         (staging / CLAIMS).write_text(json_text(result.outcome), "utf-8")
-        write_report(result.page, staging, has_pdf)
-    return in_folder(result, job.place)
+        write_report(result.report(), staging, has_pdf)
+    return in_folder(result, job.place, job.place / REPORT)
 
 
 def _write_csv(path: Path, rows: Rows) -> None:

@@ -46,10 +46,6 @@ class Simulation(Result):
     def variables(self) -> dict[str, Variable]:
         return run_variables(self.run)
 
-    def told(self) -> list[str]:
-        page = self.folder and self.folder.with_suffix(".html")
-        return [*super().told(), *([f"report: {page}"] if page and page.is_file() else [])]
-
     @property
     def agrees(self) -> bool:
         """Whether status and numbers are those of the sweep, if there is one."""
@@ -106,7 +102,7 @@ def simulated(
         again = Simulation(run, int(design.stored["status"]), found, name)
     if file is not None:
         write_results(file, again, has_report)
-    return in_folder(again, file)
+    return in_folder(again, file, file.with_suffix(".html") if file and has_report else None)
 
 
 def write_results(out: Path, found: Simulation, has_report: bool) -> None:

@@ -9,15 +9,14 @@ from studies.engine.controller import fixed_controller
 from studies.engine.run_data import run_attributes
 from studies.errors import StudyError
 from studies.job import Job
-from studies.publish import publish
+from studies.publish import REPORT, publish
 from studies.result import in_folder
 from studies.results.document import json_text
 from studies.results.labelled import variables
 from studies.show.pages import write_report
 from studies.spillover.certificate import Certificate, certify
-from studies.spillover.fast_move import run_fast_move
+from studies.spillover.fast_move import ControlEffect, run_fast_move
 from studies.spillover.proofs import prove
-from studies.spillover.say import say
 from studies.store import write_store
 from studies.study.spec import Study
 
@@ -56,27 +55,30 @@ def certified(
     certificate = job.part("plants", lambda: certify(study, margin, bases=bases))
     if has_proofs:
         job.begin("prove", "every number of modes, and a box of machines")
-        found = job.part("proofs", lambda: prove(fixed_controller(study)))
-        certificate = certificate.replace(proofs=found)
+        proofs = job.part("proofs", lambda: prove(fixed_controller(study)))
+        certificate = certificate.replace(proofs=proofs)
     job.begin("smallest change", "of the machine that breaks the design")
-    controller = fixed_controller(certificate.study)
-    change = job.part("smallest change", lambda: smallest_change(controller, tolerances))
-    certificate = certificate.replace(smallest_change=change)
+    change = job.part(
+        "smallest change", lambda: smallest_change(fixed_controller(study), tolerances)
+    )
     job.begin("fast move", "of the nominal machine, with and without control")
-    certificate = job.part("fast move", lambda: _with_fast_move(certificate))
+    move, faults = job.part("fast move", lambda: _fast_move(study))
+    certificate = certificate.replace(
+        smallest_change=change, fast_move=move, notes=(*certificate.notes, *faults)
+    )
     if job.folder is None:
         return certificate
     job.begin("draw")
     with publish(job.folder) as staging:
         write_store(staging / DATA, variables(certificate), run_attributes(study))
         (staging / DOCUMENT).write_text(json_text(certificate), encoding="utf-8")
-        write_report(say(certificate), staging, has_pdf)
-    return in_folder(certificate, job.folder)
+        write_report(certificate.report(), staging, has_pdf)
+    return in_folder(certificate, job.folder, job.folder / REPORT)
 
 
-def _with_fast_move(certificate: Certificate) -> Certificate:
-    """The same with its fast move, or with a note why it cannot run."""
+def _fast_move(study: Study) -> tuple[ControlEffect | None, tuple[str, ...]]:
+    """The fast move of a study, or a note why it cannot run."""
     try:
-        return certificate.replace(fast_move=run_fast_move(certificate.study))
+        return run_fast_move(study), ()
     except StudyError as error:
-        return certificate.replace(notes=(*certificate.notes, f"no fast move: {error}"))
+        return None, (f"no fast move: {error}",)

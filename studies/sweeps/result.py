@@ -33,7 +33,6 @@ class SweepResult(Result):
     # numbers of cases that were given up, with the reason in the folder
     lost: np.ndarray = field(default_factory=lambda: np.empty(0, int))
     screen: ScreenOutcome | None = None  # how its best designs were found; None: all are kept
-    has_report: bool = False  # whether its report was written
 
     def after(self, before: SweepResult) -> SweepResult:
         """The same with what was run before it."""
@@ -108,7 +107,7 @@ class SweepResult(Result):
         run = f"{count_text(self.n_run, 'case')} in {self.run_time:.1f} s"
         taken = f"{run} and {self.compile_time:.1f} s of compiling; "
         results = f"{taken}results: {self.folder}/results.h5"
-        return [results, *(super().told() if self.has_report else [])]
+        return [results, *super().told()]
 
 
 def read_result(folder: str | Path) -> SweepResult:

@@ -49,7 +49,7 @@ def write_sweep_report(sweep: SweepResult) -> None:
     assert sweep.folder is not None
     stale = ("cases.png", "front.png", "values.png", "influence.png")
     with publish(sweep.folder, stale=stale) as staging:
-        write_report(say(sweep), staging)
+        write_report(sweep.report(), staging)
 
 
 def say(sweep: SweepResult) -> Report:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -50,7 +49,7 @@ def sweep(
     """
     from studies.errors import StudyError
     from studies.job import again, checked_out, working
-    from studies.publish import EXPLORER
+    from studies.publish import EXPLORER, REPORT
     from studies.result import in_folder
     from studies.space.spec import load_sweep
     from studies.sweeps.dry_run import PlannedSweep
@@ -69,8 +68,7 @@ def sweep(
         done = swept_into(spec, job, workers, worker_timeout)
         if report:
             job.begin("report")
-            write_sweep_report(done)
-            done = in_folder(replace(done, has_report=True), out)
+            write_sweep_report(in_folder(done, out, out / REPORT))
         if done.n_run:  # a page of fewer cases
             (out / EXPLORER).unlink(missing_ok=True)
     if done.lost_text:

@@ -19,10 +19,9 @@ from studies.engine.run_data import run_attributes
 from studies.errors import StudyError
 from studies.job import Job, make_request
 from studies.phases import duration_text
-from studies.publish import publish
+from studies.publish import REPORT, publish
 from studies.result import in_folder
 from studies.show.pages import write_report
-from studies.show.report import plain
 from studies.show.units import count_text
 from studies.store import numbers_digest, write_store
 from studies.study.files import signed
@@ -43,7 +42,7 @@ from studies.tuning.folder import (
 from studies.tuning.optimise import Progress, is_compatible, optimise, start_families
 from studies.tuning.references import compare
 from studies.tuning.results import variables
-from studies.tuning.say import ended, file_name, say
+from studies.tuning.say import ended, file_name
 from studies.tuning.spec import TuneSpec
 from studies.tuning.workers import ClusterEvaluator, evaluate_part
 
@@ -99,8 +98,8 @@ def refuse_violated(findings: TuneFindings, job: Job) -> TuneFindings:
         StudyError: they cannot; what was found is said.
     """
     if faults := violated_limits(findings.spec, findings.at):
-        for text in say(findings).result:
-            job.say(plain(text))
+        for text in findings.lines():
+            job.say(text)
         raise StudyError("tune.limits: not satisfied together; " + "; ".join(faults))
     return findings
 
@@ -147,7 +146,7 @@ def _tune(
     job.say(ended(spec, at))
     findings = find(spec, evaluator, at, job)
     job.begin("draw")
-    _write(in_folder(findings, out), out)
+    _write(in_folder(findings, out, out / REPORT), out)
     return findings
 
 
@@ -275,4 +274,4 @@ def _write(findings: TuneFindings, out: Path) -> None:
         for name, study in tuned_studies(spec, findings.at).items():
             (staging / name).write_text(signed(study_template(study)), encoding="utf-8")
         write_store(staging / RESULTS, variables(spec, findings), attributes)
-        write_report(say(findings), staging)
+        write_report(findings.report(), staging)

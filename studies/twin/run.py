@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from studies.engine.runs import resolved_study
 from studies.job import Job
-from studies.publish import publish
+from studies.publish import REPORT, publish
 from studies.result import in_folder
 from studies.results.document import json_text
 from studies.show.pages import write_report
@@ -13,7 +13,7 @@ from studies.twin.compare import BothRuns, TwinBench, causes, our_runs, pair
 from studies.twin.margin import first_modes, margin_by_growth, ring
 from studies.twin.multibody import DEFAULT, Settings, load_exudyn
 from studies.twin.result import TwinResult, expected_poles
-from studies.twin.say import say, twin_document
+from studies.twin.say import twin_document
 
 DOCUMENT = "twin.json"
 #: What is done, with what it takes on two cores [s].
@@ -78,5 +78,5 @@ def compared_with_twin(
     job.begin("draw")
     with publish(job.folder) as staging:
         (staging / DOCUMENT).write_text(json_text(twin_document(result)), encoding="utf-8")
-        write_report(say(result), staging)
-    return in_folder(result, job.folder)
+        write_report(result.report(), staging)
+    return in_folder(result, job.folder, job.folder / REPORT)

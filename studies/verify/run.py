@@ -10,7 +10,7 @@ import numpy as np
 from studies import passport
 from studies.errors import StudyError
 from studies.job import Job
-from studies.publish import publish
+from studies.publish import REPORT, publish
 from studies.result import in_folder
 from studies.results.document import json_text
 from studies.show.pages import write_report
@@ -21,7 +21,6 @@ from studies.verify.machine import check_machine
 from studies.verify.outside import check_outside
 from studies.verify.result import ModelVerification
 from studies.verify.rows import Assumption
-from studies.verify.say import say
 from studies.verify.stepping import check_stepping
 from studies.verify.trajectories import check_trajectories
 
@@ -59,8 +58,8 @@ def verified(study: Study, job: Job) -> ModelVerification:
         return found
     with publish(job.folder) as staging:
         (staging / DOCUMENT).write_text(json_text(found), encoding="utf-8")
-        write_report(say(found), staging)
-    return in_folder(found, job.folder)
+        write_report(found.report(), staging)
+    return in_folder(found, job.folder, job.folder / REPORT)
 
 
 def _rows(name: str, check: Callable[[Study], list[Assumption]], study: Study) -> list[Assumption]:

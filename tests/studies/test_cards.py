@@ -53,7 +53,6 @@ def results():
         "Certificate": certificate(study=study),
         "Exported": Exported(SimpleNamespace(study=study), "json", (), made, ["", "", ""]),
         "ComparedVariants": ComparedVariants(
-            out=None,
             study=study,
             motion="",
             board=None,

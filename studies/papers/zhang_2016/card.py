@@ -56,7 +56,7 @@ def result_of(machines: Machines) -> CardResult:
             left_open=CARD.left_open,
         ),
         tables=_tables(machines),
-        page=say(CARD, verdicts, machines),
+        made=say(CARD, verdicts, machines),
         stores={
             name: (context.runs.study, paper_variables(context.runs, context.measures))
             for name, context in zip(Machines._fields, machines, strict=True)

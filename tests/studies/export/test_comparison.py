@@ -92,7 +92,6 @@ def test_the_cheapest_of_those_as_good_is_recommended():
         variant(20e3, 32, 2.5, 0.99e-7, 1.10),  # takes too long
     ]
     found = ComparedVariants(
-        out=None,
         study=None,
         motion="",
         board=None,

@@ -335,7 +335,7 @@ def test_settling_times_of_the_result_are_those_of_its_table(short):
 
 
 def test_every_figure_stands_beside_its_table(short):
-    report = paper.result_of(short.machines).page
+    report = paper.result_of(short.machines).report()
     drawn = [part.name for part in report.parts if isinstance(part, Drawing)]
     assert sorted(drawn) == sorted(["machine", *paper_figures.PAPER_FIGURES])
 
