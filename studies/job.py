@@ -155,14 +155,14 @@ def working(
                 yield Job(out, phases)
 
 
-def checked_out(out: str | Path | None, what: str = "a folder") -> Path:
+def checked_out(out: str | Path | None) -> Path:
     """Where a verb writes.
 
     Raises:
         StudyError: nowhere.
     """
     if out is None:
-        raise StudyError(f"--out: name {what} for the results")
+        raise StudyError("--out: name a folder for the results")
     return Path(out)
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from studies.commission.spec import parse_measured
 from studies.engine.design import load_design
 from studies.export.document import import_study
 from studies.fitting.spec import parse_fit
@@ -15,14 +16,6 @@ from studies.study.files import find_spec, read_toml
 from studies.study.spec import parse_study
 from studies.sweeps.result import read_result
 from studies.tuning.spec import parse_tuning
-
-#: What reads a file, by a section that it has; "": a study, which has none of these.
-_READERS: dict[str, Callable[[dict[str, Any]], Any]] = {
-    "": parse_study,
-    "sweep": parse_sweep,
-    "tune": parse_tuning,
-    "fit": parse_fit,
-}
 
 
 def load(what: Mapping[str, Any] | str | Path) -> Any:
@@ -45,19 +38,22 @@ def load(what: Mapping[str, Any] | str | Path) -> Any:
         0.5
     """
     if isinstance(what, Mapping):
-        section = next((name for name in _READERS if name in what), "")
-        return _READERS[section](dict(what))
+        return _parsed(dict(what), Path())
     path = Path(what)
     if path.is_dir():
         is_sweep = (path / KINDS["sweep"].mark).is_file()
         return read_result(path) if is_sweep else load_design(path).study
     if path.suffix == ".json":
         return import_study(path)
-    data = read_toml(path)
-    if "commission" in data:
-        from studies.commission.spec import load_measured
+    return _parsed(read_toml(path), find_spec(path).parent)
 
-        return load_measured(path)
+
+def _parsed(data: dict[str, Any], folder: Path) -> Any:
+    """What sections hold; folder: where files that they name are."""
+    if "commission" in data:
+        return parse_measured(data, folder)
     if "fit" in data:
-        return parse_fit(data, find_spec(path).parent)
-    return load(data) if data.keys() & _READERS.keys() else load_design(path).study
+        return parse_fit(data, folder)
+    if "tune" in data:
+        return parse_tuning(data)
+    return parse_sweep(data) if "sweep" in data else parse_study(data)

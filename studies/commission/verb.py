@@ -37,12 +37,13 @@ def commission(
         >>> commission("measured.toml", "arm").summary  # doctest: +SKIP
     """
     from studies.commission.run import DECISIVE, PHASES, commissioned
-    from studies.commission.spec import load_measured
+    from studies.commission.spec import MeasuredSpec, load_measured
     from studies.export.firmware.build import check_tools
     from studies.job import CHECKED, checked_out, make_request, working
+    from studies.study.files import as_given
 
     out = checked_out(out)
-    measured = load_measured(what) if isinstance(what, str | Path) else what
+    measured = as_given(what, MeasuredSpec, load_measured)
     if measured.commission.processor:
         check_tools()
     request = make_request(measured.data, DECISIVE) | {"files": measured.fit.data_files()}

@@ -39,10 +39,11 @@ def fit(
     """
     from studies.fitting.estimate import fit_phases
     from studies.fitting.run import DECISIVE, fitted_into
-    from studies.fitting.spec import load_fit
+    from studies.fitting.spec import FitSpec, load_fit
     from studies.job import CHECKED, make_request, working
+    from studies.study.files import as_given
 
-    spec = load_fit(what) if isinstance(what, str | Path) else what
+    spec = as_given(what, FitSpec, load_fit)
     request = make_request(spec.data, DECISIVE) | {"files": spec.data_files()}
     checked = CHECKED | {"files": "set of data"}
     with working("fit", out, request, fit_phases(spec), resume, progress, checked) as job:

@@ -22,7 +22,7 @@ from studies.study.spec import Study
 
 DOCUMENT, DATA = "certificate.json", "spillover.h5"
 #: Modules that determine the numbers, with everything they import.
-DECISIVE = ("studies.spillover.run",)
+DECISIVE = tuple(f"studies.spillover.{x}" for x in ("certificate", "fast_move", "proofs"))
 
 
 def phases(has_proofs: bool) -> dict[str, float]:

@@ -6,12 +6,15 @@ import hashlib
 import os
 import tomllib
 import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from studies.errors import DataWarning, StudyError, field_error, nearest, shown
 from studies.reading import check_depth, read_text
 from studies.study.state_space import with_matrices
+
+T = TypeVar("T")
 
 #: Folder of the package's ready-made files, available by name.
 READY = Path(__file__).parents[1] / "specs"
@@ -49,6 +52,19 @@ def ready_text(name: str) -> str:
     if name not in ready:
         raise field_error("--from", name, ", ".join(sorted(ready)), hint=nearest(name, ready))
     return ready[name].read_text(encoding="utf-8")
+
+
+def as_given(what: Any, kind: type[T], load: Callable[[str | Path], T]) -> T:
+    """What a verb is given: of a kind, or the file of one, or the name of a ready-made one.
+
+    Raises:
+        StudyError: something else, or as `load`.
+    """
+    if isinstance(what, str | Path):
+        return load(what)
+    if not isinstance(what, kind):
+        raise StudyError(f"{type(what).__name__}; expected a {kind.__name__}, or its file")
+    return what
 
 
 def read_toml(name: str | Path) -> dict[str, Any]:

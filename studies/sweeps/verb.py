@@ -51,12 +51,13 @@ def sweep(
     from studies.job import again, checked_out, working
     from studies.publish import EXPLORER, REPORT
     from studies.result import in_folder
-    from studies.space.spec import load_sweep
+    from studies.space.spec import SweepSpec, load_sweep
+    from studies.study.files import as_given
     from studies.sweeps.dry_run import PlannedSweep
     from studies.sweeps.run import make_plan, sweep_phases, swept_into
     from studies.sweeps.say import write_sweep_report
 
-    spec = load_sweep(what) if isinstance(what, str | Path) else what
+    spec = as_given(what, SweepSpec, load_sweep)
     if dry_run:
         if workers is not None:
             raise StudyError("--dry-run: plans for this process only; leave the workers out")

@@ -47,12 +47,13 @@ def tune(
     """
     from studies.errors import StudyError
     from studies.job import checked_out, working
+    from studies.study.files import as_given
     from studies.tuning.audit import audited
     from studies.tuning.folder import CHECKED, fixed_part
     from studies.tuning.run import refuse_violated, tune_phases, tune_request, tuned_into
-    from studies.tuning.spec import load_tuning
+    from studies.tuning.spec import TuneSpec, load_tuning
 
-    spec = load_tuning(what) if isinstance(what, str | Path) else what
+    spec = as_given(what, TuneSpec, load_tuning)
     if audit:
         if out is not None or resume or workers is not None:
             raise StudyError("--audit: writes no files; leave --out, --resume and --workers out")

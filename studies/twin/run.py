@@ -19,7 +19,7 @@ DOCUMENT = "twin.json"
 #: What is done, with what it takes on two cores [s].
 PHASES = {"ours": 15.0, "theirs": 60.0, "changes": 240.0, "poles": 90.0, "draw": 5.0}
 #: Modules that determine the numbers, with everything they import.
-DECISIVE = ("studies.twin.run",)
+DECISIVE = ("studies.twin.compare", "studies.twin.margin")
 
 
 def compared_with_twin(

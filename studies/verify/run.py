@@ -38,7 +38,7 @@ CHECKS: dict[str, Callable[[Study], list[Assumption]]] = {
 #: What each takes on two cores [s].
 PHASES = dict(zip(CHECKS, (10.0, 2.0, 16.0, 50.0, 70.0, 20.0), strict=True))
 #: Modules that determine the numbers, with everything they import.
-DECISIVE = ("studies.verify.run",)
+DECISIVE = tuple(check.__module__ for check in CHECKS.values())
 
 
 def verified(study: Study, job: Job) -> ModelVerification:

@@ -68,7 +68,6 @@ def with_phases(check=None, audit=None, write=None):
         _checked=check or (lambda *_: FOUND["check"]),
         audit=audit or (lambda *_: FOUND["compare derivatives"]),
         _write=write or (lambda *_: None),
-        say=lambda *_: SimpleNamespace(result=[]),
     )
 
 
