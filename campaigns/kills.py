@@ -83,15 +83,13 @@ WORKING = {
     "screen.h5",
     "tune.json",
     "request.json",
-    "answers.json",
     "progress.npz",
     "parts",
     "chunks",
     "cache",
 }
-#: And files of which only that they are whole is compared: they hold times, or hashes of files
-#: with times.
-TIMED = {"parts", "answers.json"}
+#: And files of which only that they are whole is compared: they hold times.
+TIMED = {"parts"}
 OF_ONE_CALL = {"results", "git", "run_time", "compile_time"}
 
 
@@ -462,7 +460,7 @@ def kill_command(campaign, kind, count):
 def kill_commission(campaign, count):
     """Kill a commissioning from its first stage on, from its second, and from the last two."""
     finished = campaign.whole(COMMISSION).place
-    firsts = [stage.name for stage in STAGES[:3]]
+    firsts = [*STAGES][:3]
     for k, first in enumerate(firsts):
         before = campaign.new_folder()
         shutil.copytree(finished, before)
@@ -473,7 +471,7 @@ def kill_commission(campaign, count):
 
 def remove_from(out, first):
     """Take a stage and those after it out of a commissioning's folder."""
-    names = [stage.name for stage in STAGES]
+    names = [*STAGES]
     for name in names[names.index(first) :]:
         shutil.rmtree(out / name)
     for name in ("commission.json", "report.html", *["design.toml"] * (first != "certificate")):

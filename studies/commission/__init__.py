@@ -4,8 +4,8 @@ In: a file with what was measured, what is wanted and what the controller runs o
 for each stage, as its own command makes it, and one page that says what was found, what was chosen,
 how sure that is, and what to measure next if it is not.
 
-- `spec` reads the file; `stages` are fit, tuning, certificate and firmware, each of which reads
-  the files of the one before; `machines` judges the chosen controller on every machine that the
+- `spec` reads the file; `stages` are fit, tuning, certificate and firmware, each of which adds to
+  the `findings`; `machines` judges the chosen controller on every machine that the
   data leave possible.
 - `run` goes from one stage to the next, or refuses; `say` presents it, `verb` is
   `studies.commission` and the command.

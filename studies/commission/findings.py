@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from studies.commission.machines import Possible
 from studies.commission.spec import MeasuredSpec
 from studies.engine.fast_motion import LEAST_STEPS
 from studies.fitting.spec import shown_unit
@@ -25,11 +26,19 @@ class CommissionFindings(Labelled, Result, command="commission"):
     last_stage: str = told("fit, tune, certificate or firmware", default="")
     refusals: tuple[str, ...] = told("why there is no firmware to use", default=())
     fit: dict[str, Any] | None = unwritten(default=None)  # its document
+    fitted: Study | None = unwritten(default=None)
+    possible: Possible | None = unwritten(default=None)  # machines that the data leave
     tuned: Study | None = unwritten(default=None)
     is_fast: bool = unwritten(default=False)  # whether it was tuned on a faster motion than its own
     price: str = unwritten(default="")  # of gains that were lowered after the tuning
     margins: np.ndarray | None = unwritten(default=None)  # on machines left possible, (n,)
-    certificate: dict[str, Any] | None = unwritten(default=None)  # its document
+    verdict: str = unwritten(default="")  # of the certificate
+
+    @property
+    def chosen(self) -> Study:
+        """The tuned study, for later stages."""
+        assert self.tuned is not None
+        return self.tuned
 
     @derived("", "whether there is firmware that can be used")
     def is_good(self) -> bool:
@@ -91,9 +100,8 @@ def sure_text(outcome: CommissionFindings) -> str:
         least = margin_text(outcome.gain_margin, 3)
         where = f"on {outcome.machines} machines that the data leave possible"
         parts.append(f"gain margin {least} or more {where}")
-    if outcome.certificate is not None:
-        verdict = outcome.certificate["verdict"]
-        parts.append(f"certificate, on plants of the same basis further off, {verdict}")
+    if outcome.verdict:
+        parts.append(f"certificate, on plants of the same basis further off, {outcome.verdict}")
     if outcome.last_stage == "firmware" and not outcome.refusals:
         parts.append("the exported code agrees with the design")
     return f"How sure: {'; '.join(parts) or 'not judged'}."

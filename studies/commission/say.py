@@ -18,7 +18,7 @@ def say(outcome: CommissionFindings) -> Report:
     """What a commissioning tells."""
     measured = outcome.measured
     study = outcome.tuned or measured.study
-    pages = [f"{stage.name}/{stage.page}" for stage in STAGES]
+    pages = [f"{name}/{stage.page}" for name, stage in STAGES.items()]
     numbers = list(map(_number_row, outcome.numbers))
     margins = [] if outcome.margins is None else [outcome.margins]
     return Report(

@@ -4,22 +4,21 @@ import io
 import json
 import re
 from contextlib import redirect_stdout
+from types import SimpleNamespace
 
 import jsonschema
 import numpy as np
 import pytest
 
-from studies.commission import run as commissioning
 from studies.commission import stages
 from studies.commission.findings import CommissionFindings
 from studies.commission.machines import Possible, margin_spread, margins_on, unknown_to_controller
 from studies.commission.spec import LOUDER, RESERVE, load_measured, parse_measured, tuning_section
-from studies.commission.stages import STAGES, possible_machines
 from studies.commission.verb import commission
 from studies.documents import schema
 from studies.engine.controller import fixed_controller
-from studies.engine.design import Design
-from studies.engine.fast_motion import TellingMotion, make_fast
+from studies.engine.design import Design, load_design
+from studies.engine.fast_motion import make_fast
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.export.firmware import build as building
@@ -144,16 +143,15 @@ starts = 4
     )
 
 
-def test_gains_are_lowered_until_later_stages_find_their_margins(monkeypatch, tmp_path):
+def test_gains_are_lowered_until_later_stages_find_their_margins():
     measured = parse_measured(data())
     study = STUDY.change(control__gain_factor=2.0)
     lowered = stages._lowered(study, AS_BUILT, measured)
     certificate = certify(lowered, 2.0, (study.link.basis,))
     assert certificate.is_passed and certificate.smallest_margin < 2.1
-    monkeypatch.setattr(stages, "load_design", lambda folder: Design(study, {}))
-    price = stages.price_text(tmp_path, lowered)
+    price = stages.price_text(2.0, lowered)
     assert re.match(r"lowered from 2, .* is 0\.\d+ instead of 0\.\d+", price)
-    assert stages.price_text(tmp_path, study) == ""
+    assert stages.price_text(2.0, study) == ""
 
 
 def test_plants_that_would_not_have_explained_the_data_lower_nothing():
@@ -182,40 +180,66 @@ FIT = {
 }
 
 
+TUNING = parse_tuning(
+    bare(TINY) | {"tune": {"free": {"control.gain_factor": {"from": 0.1, "to": 1.0}}}}
+)
+
+
 class Pretended:
-    """Stages that only leave the files of theirs."""
+    """What the stages call, without its work."""
 
     def __init__(self, monkeypatch, **answers):
-        self.calls = []
-        self.answers = {"fit": FIT, "margins": np.array([2.5, 3.0]), "is_passed": True} | answers
+        self.calls, self.n_judged = [], 0
+        self.answers = {"fit": FIT, "margins": np.array([2.5, 3.0]), "is_passed": True}
         self.answers |= {"is_verified": True} | answers
-        stages = tuple(stage._replace(make=self._maker(stage)) for stage in STAGES)
-        monkeypatch.setattr(commissioning, "STAGES", stages)
-        monkeypatch.setattr(commissioning, "fit_document", lambda out: self.answers["fit"])
-        monkeypatch.setattr(commissioning, "_margins", lambda job: self.answers["margins"])
-        monkeypatch.setattr(commissioning, "is_verified", lambda out: self.answers["is_verified"])
-        monkeypatch.setattr(commissioning, "certificate_document", lambda out: self._certificate())
-        tuned = type("Tuned", (), {"study": STUDY})
-        monkeypatch.setattr(commissioning, "tuned_design", lambda out: tuned)
-        monkeypatch.setattr(commissioning, "has_fast_motion", lambda out, tuned: True)
-        monkeypatch.setattr(commissioning, "price_text", lambda out, tuned: "lowered from 0.6")
+        fast = float(0.9 * np.min(STUDY.motion.move_time))
+        tuned = Design(STUDY.change(motion__move_time=fast), {})
+        given = {
+            "fitted_into": self._fitted,
+            "document": lambda found: found,
+            "_tuning": lambda measured, possible, study, job: TUNING,
+            "tuned_into": lambda spec, job: self._called("tune"),
+            "load_design": lambda path: tuned if path.name == "tune" else load_design(path),
+            "_lowered": lambda study, possible, measured: study,
+            "margins_on": self._margins,
+            "price_text": lambda first, tuned: "lowered from 0.6",
+            "certified": self._certified,
+            "export_design": self._exported,
+        }
+        for name, function in given.items():
+            monkeypatch.setattr(stages, name, function)
 
-    def _certificate(self):
+    def _called(self, stage):
+        self.calls.append(stage)
+        if self.answers.get("fails") == stage:
+            raise StudyError("contradictory limits")
+        if self.answers.get("stops") == stage:
+            raise KeyboardInterrupt
+
+    def _fitted(self, spec, job):
+        self._called("fit")
+        document = self.answers["fit"]
+        machines = np.ones((len(self.answers["margins"]), 1))
+        return SimpleNamespace(
+            document=lambda: document, names=("load.mass",), machines=machines, study=STUDY
+        )
+
+    def _margins(self, possible, study):
+        self.n_judged += 1
+        return self.answers["margins"]
+
+    def _certified(self, study, job, margin, bases):
+        self._called("certificate")
         is_passed = self.answers["is_passed"]
-        return {"is_passed": is_passed, "verdict": "passed: all" if is_passed else "failed by x"}
+        return SimpleNamespace(
+            is_passed=is_passed, verdict="passed: all" if is_passed else "failed by x"
+        )
 
-    def _maker(self, stage):
-        def make(measured, job):
-            out = job.place
-            self.calls.append(stage.name)
-            if self.answers.get("fails") == stage.name:
-                raise StudyError("contradictory limits")
-            if self.answers.get("stops") == stage.name:
-                raise KeyboardInterrupt
-            (out / stage.name).mkdir()
-            (out / stage.last[0]).write_text("{}")
-
-        return make
+    def _exported(self, design, target, out, **_):
+        self._called("firmware")
+        out.mkdir(exist_ok=True)
+        (out / "verification.html").write_text("")
+        return SimpleNamespace(is_good=self.answers["is_verified"])
 
 
 def commissioned(out, is_resumed=False):
@@ -264,47 +288,40 @@ def test_what_is_not_supported_is_refused(monkeypatch, answers, last, reason, tm
     assert "REFUSED" in page.splitlines()[0]
 
 
-def test_a_stage_is_not_done_twice(monkeypatch, tmp_path):
+def test_what_was_found_is_not_sought_again(monkeypatch, tmp_path):
     pretended = Pretended(monkeypatch, stops="certificate")
     with pytest.raises(KeyboardInterrupt):
         commissioned(tmp_path / "out")
     with pytest.raises(StudyError, match="add --resume"):
         commissioned(tmp_path / "out")
     pretended.answers["stops"] = ""
-    made, text, _ = commissioned(tmp_path / "out", is_resumed=True)
-    assert made.is_good and "already computed" in text
-    assert pretended.calls == ["fit", "tune", "certificate", "certificate", "firmware"]
+    made, *_ = commissioned(tmp_path / "out", is_resumed=True)
+    assert made.is_good and pretended.n_judged == 1
+    assert pretended.calls == ["fit", "tune", "certificate"] + list(stages.STAGES)
     other = data(commission={"gain_margin": 3.0})
     with pytest.raises(StudyError, match="begun with another input;"):
         commission(parse_measured(other), tmp_path / "out", resume=True)
 
 
-def test_a_changed_answer_is_refused(monkeypatch, tmp_path):
+def test_a_changed_answer_is_written_again(monkeypatch, tmp_path):
+    """No stage reads the file of another one, which somebody may have edited."""
     Pretended(monkeypatch)
     commissioned(tmp_path / "out")
-    for name in ("fit/fit.json", "design.toml", "answers.json"):
-        file = tmp_path / "out" / name
-        content = file.read_bytes()
-        file.write_bytes(content + b"x")
-        with pytest.raises(StudyError, match=f"{name}: damaged"):
-            commission(parse_measured(data()), tmp_path / "out", resume=True)
-        file.write_bytes(content)
+    file = tmp_path / "out" / "design.toml"
+    content = file.read_text()
+    file.write_text(content.replace("gain_factor", "gain_facto"))
+    commissioned(tmp_path / "out", is_resumed=True)
+    assert file.read_text() == content
 
 
 def test_a_tuning_killed_before_its_first_iteration_begins_again(monkeypatch, tmp_path):
-    def killed(spec, job):
-        raise KeyboardInterrupt
-
-    possible = Possible(("link.damping_ratio",), np.linspace(0.01, 0.02, 20)[:, None])
-    monkeypatch.setattr(stages, "tuned_into", killed)
-    monkeypatch.setattr(stages, "fitted_study", lambda out: STUDY)
-    monkeypatch.setattr(stages, "possible_machines", lambda out: possible)
-    monkeypatch.setattr(stages, "margin_spread", lambda possible, study: 1.0)
-    monkeypatch.setattr(stages, "find_motion", lambda study: TellingMotion(study, ""))
-    tune = next(stage for stage in STAGES if stage.name == "tune")
+    Pretended(monkeypatch, stops="tune")
+    known = CommissionFindings(
+        None, parse_measured(data()), "", fitted=STUDY, possible=Possible((), np.ones((1, 0)))
+    )
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
-            tune.make(parse_measured(data()), quiet_job(tmp_path))
+            stages.STAGES["tune"].run(known, quiet_job(tmp_path))
     assert (tmp_path / "tune" / "tune.json").is_file()
 
 
@@ -353,7 +370,7 @@ def test_a_machine_made_by_a_richer_model(seed, tmp_path):
     measured = parse_measured(whole, tmp_path)
     made = commission(measured, tmp_path / "out")
     assert made.is_good, made.refusals
-    assert len(possible_machines(tmp_path / "out").values) == 64
+    assert len(made.possible.values) == 64
     tuned, fast = made.tuned, make_fast(true)
     assert margin_on(true, tuned) >= 2
     best = tuned_on(true, measured, tmp_path / "best")
