@@ -61,13 +61,14 @@ from studies.kernels import compilation
 from studies.kernels.compilation import ObjectCache, _key
 from studies.passport import Passport
 from studies.results.labelled import Variable
+from studies.show.report import print_report
 from studies.space.spec import load_sweep, parse_sweep
 from studies.space.table import build_table
 from studies.store import write_store
 from studies.study.files import READY, read_toml
 from studies.study.spec import Study, load_study
 from studies.sweeps.run import case_content
-from studies.sweeps.show import print_cases, ranked_cases, show
+from studies.sweeps.show import best_report, overview, ranked_cases
 from studies.tuning import explore as tuning_explorer
 from studies.tuning.folder import (
     CHECKED,
@@ -354,9 +355,9 @@ def read_sweep_file(path):
 
 def read_sweep_folder(path):
     data, console = read_sweep(path), Console(file=StringIO())
-    show(data, console, False)
+    print_report(overview(data), console)
     cases = ranked_cases(data, "residual_rms", "gain_margin > 0", 10)
-    print_cases(data, cases, ["residual_rms"], console)
+    print_report(best_report(data, "residual_rms", "", cases, "", []), console)
     load_design(path, "0")
 
 

@@ -35,7 +35,7 @@ from studies.papers.verb import paper
 from studies.results.document import AsJson, print_document
 from studies.single.verb import modes, plant, simulate
 from studies.spillover.verb import certify
-from studies.sweeps.commands import add_commands as add_sweeps
+from studies.sweeps import reading
 from studies.sweeps.verb import sweep
 from studies.threads import COMPILING
 from studies.tuning.verb import tune
@@ -211,7 +211,8 @@ VERBS: dict[Callable[..., Any], bool] = {
 }
 for verb, has_precision in VERBS.items():
     add_verb(app, console, verb, has_precision)
-add_sweeps(app, console)
+for verb in (reading.show, reading.best, reading.plot, reading.sensitivity):
+    add_verb(app, console, verb, starts=False)
 
 
 @app.command()

@@ -56,7 +56,11 @@ _TAKEN = {
 
 
 def add_verb(
-    app: typer.Typer, console: Console, verb: Callable[..., Any], has_precision: bool = False
+    app: typer.Typer,
+    console: Console,
+    verb: Callable[..., Any],
+    has_precision: bool = False,
+    starts: bool = True,
 ) -> None:
     """Add the command of a verb to the command line.
 
@@ -64,6 +68,7 @@ def add_verb(
         app, console: of the command line.
         verb: a public function; "-" stands for "_" in its options.
         has_precision: whether the command can also compute in single precision, and on GPUs.
+        starts: whether it computes, and hence starts JAX.
     """
     given = inspect.signature(verb).parameters
     about, texts = documented(verb)
@@ -81,7 +86,8 @@ def add_verb(
                 check_folder(out)
             if verb.__name__ in KINDS:
                 refuse_existing(Path(out), verb.__name__, values.get("resume", False))
-        start(precision, gpu=has_precision and not values.get("workers"))
+        if starts:
+            start(precision, gpu=has_precision and not values.get("workers"))
         for name, parameter in given.items():
             option = f"--{name.replace('_', '-')}"
             values[name] = _taken(parameter).read(option, values[name])

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import prod
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from studies.engine.columns import PER_CASE
-from studies.engine.results import SweepData, as_sweep, swept_names
+from studies.engine.results import SweepData, swept_names
 from studies.results.labelled import Variable
 from studies.space.spec import BlockNode
 from studies.space.table import all_columns
@@ -23,29 +22,20 @@ if TYPE_CHECKING:
 _DIMENSIONS = {"patches.centers": "placement", "shaper.frequencies_hz": "shaper_frequency"}
 
 
-def load(path: str | Path) -> xarray.Dataset:
+def as_dataset(data: SweepData) -> xarray.Dataset:
     """Results of a sweep, finished or not, under the names of the sweep file.
 
-    The dimensions of a full grid are its axes: `load("gains").sel({"control.gain_factor": 2.0})`.
+    The dimensions of a full grid are its axes, as in `load("gains").data.sel({"gain": 2.0})`.
     Of zipped, listed or sampled axes, and of a grid that `where` has thinned out, there is one
     dimension `case` with the axes as coordinates along it. Links and modes count from 1.
 
     Args:
-        path: the sweep's folder.
+        data: of the sweep.
 
     Returns:
         Metrics, `status` as a code and `status_text` in words, with units and long names as
-        attributes. Cases that have not run have status -1 and NaN. What the folder has of another
-        sweep, or damaged, is left out with a warning, also kept as the attribute `notes`.
-
-    Raises:
-        StudyError: no sweep there, a damaged file, or results of another version.
+        attributes. Cases that have not run have status -1 and NaN.
     """
-    return as_dataset(as_sweep(path))
-
-
-def as_dataset(data: SweepData) -> xarray.Dataset:
-    """The same of a sweep's data as read."""
     import xarray
 
     data = _whole_grid(data)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -99,17 +98,6 @@ class SweepData:
 def swept_names(data: SweepData) -> list[str]:
     """What varies, as variables of the file, in the order of the sweep; labels stand for fields."""
     return data.table.axes
-
-
-def as_sweep(sweep: SweepData | str | Path) -> SweepData:
-    """What a function of a sweep is given: its data, or its folder, with a warning of its notes.
-
-    Errors as `read_sweep`.
-    """
-    data = sweep if isinstance(sweep, SweepData) else read_sweep(sweep)
-    for note in data.notes if data is not sweep else ():
-        warnings.warn(note, stacklevel=3)
-    return data
 
 
 def read_sweep(path: str | Path, cases: CaseTable | None = None) -> SweepData:

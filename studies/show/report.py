@@ -102,6 +102,11 @@ def chapter(title: str, *parts: Part) -> Chapter | None:
     return Chapter(title, shown) if shown else None
 
 
+def listed(*parts: Part) -> Report:
+    """Parts alone, for the console."""
+    return Report("", (), "", "", parts, (), {})
+
+
 def drawing(
     draw: Callable[..., Any], *arguments: Any, name: str = "", height: float = 0.0
 ) -> Drawing:
@@ -146,20 +151,14 @@ def sentence(text: str) -> str:
     return start + first + closed[1:] if rest else ""
 
 
-def print_result(report: Report, console: Console) -> None:
-    """Print the result, a sentence a line."""
-    for text in report.lines():
-        console.print(text, soft_wrap=True)
-
-
 def print_report(report: Report, console: Console) -> None:
-    """Print the result, and the texts and tables below it."""
-    print_result(report, console)
-    for part in report.parts:
+    """Print the result, a sentence a line, and the texts and tables below it."""
+    for part in [*report.lines(), *report.parts]:
         if isinstance(part, Rows):
             print_rows(part, console)
         elif isinstance(part, str) and part:
-            console.print(plain(part), soft_wrap=True)
+            style = "bold red" if part.startswith("**") else None
+            console.print(plain(part), soft_wrap=True, style=style)
 
 
 def plain(text: str) -> str:

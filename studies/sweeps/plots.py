@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from jaxmodel import status
 from jaxmodel.loop_figures import HIGHEST
 from studies.engine.front import pareto_front
-from studies.engine.results import SweepData, as_sweep, metric_values, swept_names
+from studies.engine.results import SweepData, metric_values, swept_names
 from studies.errors import StudyError
 from studies.show import figures
 from studies.show.sketch import ACTUATOR, SENSOR
@@ -49,11 +49,11 @@ MOST_LINES, MOST_LISTS = 3000, 12
 LINE = 120
 
 
-def plot(sweep: SweepData | str | Path, x: str | None, y: str, hue: str | None = None) -> Figure:
+def plot(data: SweepData, x: str | None, y: str, hue: str | None = None) -> Figure:
     """Cases of status ok: what varies, and what ranks them.
 
     Args:
-        sweep: its folder, or its data as read.
+        data: of the sweep.
         x: axis or metric along the abscissa; None: all axes at once.
         y: metric or axis.
         hue: axis or metric that sets the colour.
@@ -61,7 +61,6 @@ def plot(sweep: SweepData | str | Path, x: str | None, y: str, hue: str | None =
     Raises:
         StudyError: unknown name, or no finished case.
     """
-    data = as_sweep(sweep)
     value = metric_values(data, y)
     if value.dtype.kind not in "fiub":
         raise StudyError(f"--y {y}: a text, not a number")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from studies.engine.folder import read_manifest
-from studies.engine.results import SweepData, as_sweep
+from studies.engine.results import SweepData, read_sweep
 from studies.result import Result, in_folder
 from studies.results.labelled import Labelled, Variable
 from studies.screen.run import ScreenOutcome
@@ -45,9 +46,12 @@ class SweepResult(Result):
 
     @cached_property
     def found(self) -> SweepData:
-        """The cases as they are in the folder."""
+        """The cases as they are in the folder; what of it is not among them, is warned of."""
         assert self.folder is not None
-        return as_sweep(self.folder)
+        data = read_sweep(self.folder)
+        for note in data.notes:
+            warnings.warn(note, stacklevel=3)
+        return data
 
     @property
     def lost_text(self) -> str:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from jaxmodel import status
-from studies.engine.results import SweepData, as_sweep, metric_values, swept_names
+from studies.engine.results import SweepData, metric_values, swept_names
 from studies.errors import StudyError
 from studies.results.labelled import Labelled, labelled, told
 from studies.space.axes import build_axis
@@ -103,17 +101,16 @@ def scalar_columns(data: SweepData) -> list[tuple[str, np.ndarray]]:
     return columns
 
 
-def analyse(sweep: SweepData | str | Path, metric: str) -> Analysis:
+def analyse(data: SweepData, metric: str) -> Analysis:
     """Analyse the factors of a sweep's design.
 
     Args:
-        sweep: folder of one by a method with an analysis, or its data as read.
+        data: of a sweep by a method with an analysis.
         metric: to analyse.
 
     Raises:
         StudyError: no such design or metric, or too many cases failed.
     """
-    data = as_sweep(sweep)
     names, value = factor_names(data), design_values(data, metric)
     seed, analysis = data.spec.sweep.seed, METHODS[data.spec.sweep.method].analysis
     assert analysis is not None

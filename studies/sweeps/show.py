@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Console
-from rich.markup import escape
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
@@ -17,7 +14,6 @@ from studies.engine.columns import ON_DEMAND, PER_CASE
 from studies.engine.results import (
     ROUNDING,
     SweepData,
-    as_sweep,
     counted_links,
     direction,
     is_worse,
@@ -27,10 +23,11 @@ from studies.engine.results import (
     uncontrolled_value,
 )
 from studies.errors import ResolutionWarning, StudyError, field_error
-from studies.show.listing import Rows, print_rows
-from studies.show.report import sentence
+from studies.show.listing import Rows
+from studies.show.report import Part, Report, listed, sentence
 from studies.show.units import count_text, headed, number, readable, settling_text
 from studies.show.words import motion_text
+from studies.space.methods import Analysis
 from studies.study.entries import links_text
 from studies.study.margin import ENOUGH, GUESSED, margin_text
 from studies.study.resolution import is_deflection, least_step, resolution_text
@@ -81,16 +78,14 @@ SHARES = (
 )
 
 
-def best_cases(
-    sweep: SweepData | str | Path, by: str, subject_to: str = "", count: int = 10
-) -> pandas.DataFrame:
+def best_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10) -> pandas.DataFrame:
     """The cases with the smallest metric, best first; for `LARGEST_FIRST`, the largest.
 
-    For example `best_cases("gains", "residual_rms", "gain_margin > 2", count=5)`. Warns
+    For example `load("gains").best("residual_rms", "gain_margin > 2", count=5)`. Warns
     (`ResolutionWarning`) of deflections below one ADC step, which the controller cannot measure.
 
     Args:
-        sweep: its folder, or its data as read.
+        data: of the sweep.
         by: metric or entry of one; with "-" in front, in reverse order.
         subject_to: condition on metrics and axes.
         count: how many.
@@ -109,7 +104,7 @@ def best_cases(
             raise field_error(field, text, "a text")
     if not isinstance(count, int) or count < 1:
         raise field_error("count", count, "a whole number from 1")
-    data, name = as_sweep(sweep), by.removeprefix("-")
+    name = by.removeprefix("-")
     cases = ranked_cases(data, by, subject_to, count)
     text = resolution_warning(data, cases, name)
     if text:
@@ -117,14 +112,14 @@ def best_cases(
     return _frame(data, {x: design_values(data, x) for x in with_others(data, [name])}, cases)
 
 
-def table(sweep: SweepData | str | Path) -> pandas.DataFrame:
+def table(data: SweepData) -> pandas.DataFrame:
     """All cases of a sweep, a row each.
 
-    For example `table("gains").plot.scatter("control.gain_factor", "residual_rms")`, or
-    `table("gains").status.value_counts()`.
+    For example `load("gains").table().plot.scatter("control.gain_factor", "residual_rms")`, or
+    `load("gains").table().status.value_counts()`.
 
     Args:
-        sweep: its folder, or its data as read.
+        data: of the sweep.
 
     Returns:
         By the number of the case: its id, what varies (of a list, such as a placement, a column per
@@ -134,7 +129,6 @@ def table(sweep: SweepData | str | Path) -> pandas.DataFrame:
     Raises:
         StudyError: no sweep there, a damaged file, or results of another version.
     """
-    data = as_sweep(sweep)
     codes, which = np.unique(data["status"], return_inverse=True)
     words = np.array([reason(code) for code in codes.tolist()])[which]
     kept = [x for x in (MARGIN, "damping_ratio", *ON_DEMAND, *METRICS) if x in data.variables]
@@ -173,24 +167,36 @@ def ranked_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10
     return chosen[np.argsort(-value[chosen] if is_large else value[chosen], kind="stable")][:count]
 
 
-def show(data: SweepData, console: Console, is_failed: bool) -> None:
-    """Print an overview, or the failed cases one by one, and what the failures depend on."""
-    if is_failed:
-        _print_failed(data, console)
-    else:
-        _print_overview(data, console)
-    if (causes := cause_rows(data)).rows:
-        console.print(f"what the failures depend on ({SHARES}):", soft_wrap=True)
-        print_rows(causes, console)
-
-
-def _print_overview(data: SweepData, console: Console) -> None:
-    console.print(f"{data.spec.study.title}: {data.n_cases} cases, {', '.join(swept_names(data))}")
-    print_rows(status_rows(data), console)
+def overview(data: SweepData) -> Report:
+    """How the cases ended, the best ones, and what the failures depend on."""
     by = ranking(data)
+    best: list[Part] = []
     if is_ranked(data, by):
         condition = requirement(data, by)
-        print_best(data, by, condition, ranked_cases(data, by, condition), console)
+        best = best_parts(data, by, condition, ranked_cases(data, by, condition))
+    text = f"{data.spec.study.title}: {data.n_cases} cases, {', '.join(swept_names(data))}"
+    return listed(text, status_rows(data), *best, *_cause_parts(data))
+
+
+def best_report(
+    data: SweepData, by: str, condition: str, cases: np.ndarray, agreed: str, changes: list[str]
+) -> Report:
+    """The best cases, how well a linear model ranks them, and what breaks each of them."""
+    found = best_parts(data, by, condition, cases, agreed)
+    return listed(*found, left_out(data), *changes)
+
+
+def sensitivity_report(data: SweepData, by: str, analysis: Analysis) -> Report:
+    """Which parameters matter for a metric."""
+    text = f"{label(data, by)}, {len(data.table.origin)} rows of a {data.spec.sweep.method} design"
+    rows = Rows(list(analysis.heads), [list(row) for row in analysis.rows])
+    lost = f"left out because of failed cases: {analysis.n_left_out} {analysis.what}"
+    return listed(text, *analysis.notes, rows, lost if analysis.n_left_out else "")
+
+
+def _cause_parts(data: SweepData) -> list[Part]:
+    causes = cause_rows(data)
+    return [f"what the failures depend on ({SHARES}):", causes] if causes else []
 
 
 def ranking_text(data: SweepData, by: str, condition: str = "") -> str:
@@ -227,11 +233,11 @@ def status_rows(data: SweepData) -> Rows:
     return Rows(["status", "cases", "share [%]"], rows)
 
 
-def _print_failed(data: SweepData, console: Console) -> None:
+def failed_report(data: SweepData) -> Report:
+    """The failed cases one by one, and what the failures depend on."""
     failed = failed_cases(data)
     if not len(failed):
-        console.print("no failed case")
-        return
+        return listed("no failed case")
     names = swept_names(data)
     rows = []
     for record in failed_records(data, failed[:LONGEST_TABLE]):
@@ -239,37 +245,29 @@ def _print_failed(data: SweepData, console: Console) -> None:
         cells = (short_value(record[name]) for name in names)
         rows.append([*_identity(record), record["status_text"], time, *cells])
     heads = ["case", "id", "status", "from [s]", *(label(data, name) for name in names)]
-    print_rows(Rows(heads, rows), console)
-    if len(failed) > LONGEST_TABLE:
-        console.print(
-            f"and {len(failed) - LONGEST_TABLE} more; all of them: --json, or studies.load",
-            soft_wrap=True,
-        )
+    more = f"and {len(failed) - LONGEST_TABLE} more; all of them: --json, or studies.load"
+    is_long = len(failed) > LONGEST_TABLE
+    return listed(Rows(heads, rows), more if is_long else "", *_cause_parts(data))
 
 
-def print_best(
-    data: SweepData, by: str, condition: str, cases: np.ndarray, console: Console, agreed: str = ""
-) -> None:
-    """Print the best cases, below what they compare with and how well a linear model ranks them."""
+def best_parts(
+    data: SweepData, by: str, condition: str, cases: np.ndarray, agreed: str = ""
+) -> list[Part]:
+    """The best cases, below what they compare with and how well a linear model ranks them."""
     name = by.removeprefix("-")
-    for text in (uncontrolled_text(data, name), agreed, f"{ranking_text(data, by, condition)}:"):
-        if text:
-            console.print(text, soft_wrap=True)
-    print_cases(data, cases, [name], console)
+    ranked = f"{ranking_text(data, by, condition)}:"
+    return [uncontrolled_text(data, name), agreed, ranked, *case_parts(data, cases, name)]
 
 
-def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console: Console) -> None:
-    """Print `case_rows`, and any warnings."""
-    if text := environments_text(data):
-        console.print(text, soft_wrap=True)
-    print_rows(case_rows(data, cases, metrics), console)
-    note = mark_note(data, cases, metrics[0])
-    if note:
-        console.print(note, soft_wrap=True)
-    if is_there(data, MARGIN):
-        console.print(GUESSED, soft_wrap=True)
-    for warning in ranking_warnings(data, cases, metrics[0]):
-        console.print(f"[bold red]{escape(warning)}[/]", soft_wrap=True, markup=True)
+def case_parts(data: SweepData, cases: np.ndarray, by: str) -> list[Part]:
+    """`case_rows`, and what is to be known of them."""
+    return [
+        environments_text(data),
+        case_rows(data, cases, [by]),
+        mark_note(data, cases, by),
+        GUESSED if is_there(data, MARGIN) else "",
+        *(f"**{warning}**" for warning in ranking_warnings(data, cases, by)),
+    ]
 
 
 def ranking_warnings(data: SweepData, cases: np.ndarray, by: str) -> list[str]:
@@ -385,10 +383,10 @@ def _number_text(data: SweepData, name: str, record: Record) -> str:
     return f"{value:.4g}"
 
 
-def print_left_out(data: SweepData, console: Console) -> None:
-    """Report how many cases are not ok and hence left out."""
-    if (data["status"] != status.OK).any():
-        console.print(f"left out: {left_out_text(data, data['status'] != status.OK)}")
+def left_out(data: SweepData) -> str:
+    """How many cases are not ok and hence left out, "" if none."""
+    is_left = data["status"] != status.OK
+    return f"left out: {left_out_text(data, is_left)}" if is_left.any() else ""
 
 
 def left_out_text(data: SweepData, is_left: np.ndarray) -> str:

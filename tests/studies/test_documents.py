@@ -35,7 +35,7 @@ from tests.studies.sweeps.test_sweep_tables import (
 from tests.studies.test_cli import SHORT, refused, run
 
 #: Commands whose results have no document of their own.
-WITHOUT = {"atlas", "explore", "export", "plant", "tune"}
+WITHOUT = {"atlas", "explore", "export", "plant", "plot", "tune"}
 SWEEP = """
 [sweep]
 where = "gain < 0.9"
