@@ -46,6 +46,7 @@ class Phases:
         self._typical = dict(names) if isinstance(names, Mapping) else {}
         self._started = self._since = time.perf_counter()
         self._took = self._planned = 0.0  # by finished phases, and typically [s]
+        self._first = 0  # steps that were done when the present phase began
         self._bar: Progress | None = None
         self._line: Any = None  # of a notebook
         self._title = ""
@@ -78,15 +79,16 @@ class Phases:
         if self._bar is not None:
             self._bar.stop()
 
-    def begin(self, name: str, note: str = "") -> None:
+    def begin(self, name: str, note: str = "", done: int = 0) -> None:
         """A phase begins, perhaps again.
 
-        name: one of `names`. note: what is done in it.
+        name: one of `names`. note: what is done in it. done: its steps that an earlier call or
+            phase has done.
         """
         now, typical = time.perf_counter(), self._typical.get(self.present, 0.0)
         if now - self._since > KEPT * typical:  # what was found before says nothing of this machine
             self._took, self._planned = self._took + now - self._since, self._planned + typical
-        self.present, self._since = name, now
+        self.present, self._since, self._first = name, now, done
         note = "; ".join(filter(None, (note, self._left())))
         title = self._title = f"{name} ({self.names.index(name) + 1} of {len(self.names)})"
         if self._bar is not None:
@@ -104,15 +106,19 @@ class Phases:
         rest = self.names[self.names.index(self.present) :]
         return f"about {duration_text(factor * sum(self._typical[x] for x in rest))} left"
 
-    def advance(self, done: int, total: int, text: str, left: str = "") -> None:
-        """Show how far the present phase is.
+    def rate(self, done: int) -> float:
+        """Steps of the present phase per second."""
+        return (done - self._first) / max(time.perf_counter() - self._since, 1e-9)
 
-        done, total: steps. text: about them. left: the time that the rest of the phase takes, ""
-            if it is unknown.
+    def advance(self, done: int, total: int, text: str, more: float = 0.0) -> None:
+        """Show how far the present phase is, and how long its other steps take at its rate so far.
+
+        done, total: steps. text: about them. more: what it takes beside them [s].
         """
-        if left:
+        if self._first < done < total:
             later = ", ".join(self.names[self.names.index(self.present) + 1 :])
-            text += f"; {left} left" + (f" in this phase, then {later}" if later else "")
+            left = duration_text((total - done) / self.rate(done) + more)
+            text += f"; about {left} left" + (f" in this phase, then {later}" if later else "")
         if self._bar is not None:
             self._bar.update(self._bar.task_ids[0], total=total, completed=done, text=text)
         else:

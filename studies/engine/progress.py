@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxmodel import status
 from studies.engine.folder import ranges
-from studies.phases import Phases, duration_text
+from studies.phases import Phases
 
 
 class Reporter:
@@ -40,30 +40,25 @@ class Reporter:
         self.compile_time += seconds
         waited = f", compiled in {seconds:.1f} s" if seconds >= 0.05 else ""
         self.say(f"executor: {executor}{waited}")
-        self.phases.begin(self.name)
+        self.phases.begin(self.name, done=self.done)
 
     def chunk(self, codes: np.ndarray) -> None:
         """Count a chunk that is safely on disk; codes are its statuses."""
         if self.phases.present != self.name:  # nothing had to be compiled
-            self.phases.begin(self.name)
+            self.phases.begin(self.name, done=self.done)
         self.done += len(codes)
         self.n_run += len(codes)
         self.failures.update(int(code) for code in codes if code != status.OK)
         text = f"{self.done}/{self.total} cases, {self.rate:.3g} cases/s, {self.failure_text()}"
-        self.phases.advance(self.done, self.total, text, self._left())
+        # programs left compile as long as those before
+        programs = max(self.programs - self.n_compiled, 0)
+        compiling = programs * self.compile_time / max(self.n_compiled, 1)
+        self.phases.advance(self.done, self.total, text, compiling)
 
     def lost(self, rows: np.ndarray, reason: str) -> None:
         """Report a chunk that was given up; rows are the numbers of its cases."""
         text = f"cases {ranges(rows)} are left out: {reason}"
         self.phases.console.print(text, soft_wrap=True)
-
-    def _left(self) -> str:
-        """Time for the cases left, and for compiling their programs as long as those before."""
-        if self.done >= self.total:
-            return ""
-        programs = max(self.programs - self.n_compiled, 0)
-        compiling = programs * self.compile_time / max(self.n_compiled, 1)
-        return f"about {duration_text((self.total - self.done) / self.rate + compiling)}"
 
     @property
     def run_time(self) -> float:

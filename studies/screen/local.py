@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple, Protocol, TypeVar
@@ -11,7 +10,7 @@ from typing import NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from jaxmodel import status
-from studies.phases import Phases, duration_text
+from studies.phases import Phases
 from studies.screen.shards import ScreenRequest, shard_tally, table_of
 from studies.screen.tally import LEFT_OUT, Tally
 from studies.space.table import CaseTable
@@ -27,23 +26,18 @@ class ScreenProgress:
 
     def __init__(self, phases: Phases, total: int, done: int) -> None:
         self.say, self._phases = phases.say, phases
-        self._total, self._done, self._before = total, done, done
-        self._began, self._next, self._n_failed = time.perf_counter(), 0.0, 0
+        self._total, self._done, self._next, self._n_failed = total, done, 0.0, 0
 
     def add(self, endings: np.ndarray) -> None:
         """Some designs are done; how many have each status code, or were left out."""
         self._done += int(endings.sum())
         self._n_failed += int(endings[:LEFT_OUT].sum() - endings[status.OK])
-        elapsed = time.perf_counter() - self._began
-        if elapsed < self._next and self._done < self._total:
+        elapsed, done, total = self._phases.elapsed, self._done, self._total
+        if elapsed < self._next and done < total:
             return
         self._next = max(elapsed + 1, 1.02 * elapsed)
-        rate = (self._done - self._before) / max(elapsed, 1e-9)
-        left = duration_text((self._total - self._done) / rate) if rate else ""
-        text = (
-            f"{self._done:,} of {self._total:,} designs, {rate:,.0f}/s, {self._n_failed:,} not ok"
-        )
-        self._phases.advance(self._done, self._total, text, left and f"about {left}")
+        text = f"{done:,} of {total:,} designs, {self._phases.rate(done):,.0f}/s"
+        self._phases.advance(done, total, f"{text}, {self._n_failed:,} not ok")
 
 
 class ShardWork(NamedTuple):

@@ -64,7 +64,7 @@ def run_screen(screen: ScreenRequest, job: Job, screener: Screener) -> ScreenOut
     is_done, tally = begin(job.place, screen)
     left = np.flatnonzero(~is_done).tolist()
     shards = count_text(screen.n_shards, "shard")
-    job.begin("screen", f"{screen.n_designs:,} designs in {shards}")
+    job.begin("screen", f"{screen.n_designs:,} designs in {shards}", tally.n_designs)
     agreed = _agreement(screen)
     progress = ScreenProgress(job.phases, screen.n_designs, tally.n_designs)
     with interrupts() as stop:

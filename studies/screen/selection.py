@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +9,6 @@ import numpy as np
 from studies.engine.chunks import judge_cases
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.job import Job
-from studies.phases import duration_text
 from studies.screen.shards import ScreenRequest, designs_table
 from studies.screen.tally import Tally
 from studies.space.table import CaseTable
@@ -52,7 +50,7 @@ def select(screen: ScreenRequest, tally: Tally, count: int, job: Job) -> Selecti
     value = tally.value[np.isin(tally.row, table.row)]  # without those left out as duplicates
     if not least:
         table, value = table.rows(np.arange(min(count, len(table)))), value[:count]
-    margin, total, began = np.zeros(0), len(table), time.perf_counter()
+    margin, total = np.zeros(0), len(table)
     has_loop = Fields(table.study, table.fields).raw("control.feedback") == "sampled"
     has_loop, is_kept = np.broadcast_to(has_loop, total), np.zeros(0, bool)
     while len(margin) < total and is_kept.sum() < count:
@@ -61,9 +59,8 @@ def select(screen: ScreenRequest, tally: Tally, count: int, job: Job) -> Selecti
         is_kept = (margin >= least) | ~has_loop[: len(margin)] | (least == 0)
         n_kept, n_judged = int(is_kept.sum()), len(margin)
         needed = min(total, n_judged * count / max(n_kept, 1))
-        rest = (time.perf_counter() - began) * max(needed / n_judged - 1, 0)
         text = f"{n_judged:,} of {total:,} judged, {n_kept:,} with a margin of at least {least:g}"
-        job.advance(n_judged, total, text, f"about {duration_text(rest)}")
+        job.advance(n_judged, int(needed), text)
     judged = np.arange(len(margin))
     is_kept &= np.cumsum(is_kept) <= count
     return Selection(table.rows(judged), value[judged], margin, is_kept)

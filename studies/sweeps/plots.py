@@ -146,19 +146,12 @@ def front(data: SweepData, y: str) -> Figure:
     margin, value = data[MARGIN][chosen], shown_metric(data, y)[chosen]
     with figures.styled():
         figure, ax = figures.one_panel(4.2)
-        color: Any = figures.SERIES[0]
+        colors: dict[str, Any] = {"c": figures.SERIES[0]}
         if VOLTAGE in data.variables:
-            color = metric_values(data, VOLTAGE)[chosen]
-        dots = ax.scatter(
-            margin,
-            value,
-            s=5,
-            c=color,
-            cmap=MAP,
-            linewidths=0,
-            rasterized=True,
-            norm="log" if VOLTAGE in data.variables and figures.is_wide(color) else None,
-        )
+            voltage = metric_values(data, VOLTAGE)[chosen]
+            norm = "log" if figures.is_wide(voltage) else None
+            colors = {"c": voltage, "cmap": MAP, "norm": norm}
+        dots = ax.scatter(margin, value, s=5, linewidths=0, rasterized=True, **colors)
         if VOLTAGE in data.variables:
             figure.colorbar(dots, ax=ax, label=label(data, VOLTAGE))
         # margins are the same if four digits are

@@ -22,10 +22,16 @@ _NO_NAME = r"[^\w.-]+"
 
 
 class Reading(Result):
-    """What a command says of a sweep; one of both is made."""
+    """What a command says of a sweep: tells and makes its report and its document, if asked."""
 
-    def __init__(self, report: Callable[[], Report], document: Callable[[], Labelled]) -> None:
-        self.report, self.document = report, document  # type: ignore[method-assign]
+    def __init__(self, tells: Callable[[], Report], makes: Callable[[], Labelled]) -> None:
+        self._tells, self._makes = tells, makes
+
+    def report(self) -> Report:
+        return self._tells()
+
+    def document(self) -> Labelled:
+        return self._makes()
 
 
 def _read(what: str | Path) -> SweepData:

@@ -7,7 +7,6 @@ with the best numbers, one file per family, from the first better design on), th
 from __future__ import annotations
 
 import json
-import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ from studies.cluster.connect import TIMEOUT, Place, on_workers
 from studies.engine.run_data import run_attributes
 from studies.errors import StudyError
 from studies.job import Job, make_request
-from studies.phases import duration_text
 from studies.publish import REPORT, publish
 from studies.result import in_folder
 from studies.show.pages import write_report
@@ -118,7 +116,7 @@ def _tune(
     if before is not None:
         job.say(f"continuing after iteration {int(before.iteration)}")
     job.begin("compile", "starting points by the linear loop, and the first iteration")
-    evaluator, clock = evaluator or make_evaluator(spec), _Clock()
+    evaluator = evaluator or make_evaluator(spec)
     left = spec.tune.iterations - (0 if before is None else int(before.iteration))
     job.say(
         f"{count_text(len(evaluator.families), 'starting point')}: {evaluator.lanes} runs with "
@@ -131,10 +129,10 @@ def _tune(
     def keep(at: Progress) -> None:
         save_progress(out / PROGRESS, at)
         written.update(write_designs(out, tuned_studies(spec, at, is_over=False), written))
+        done = int(at.iteration)
         if job.phases.present == "compile":  # the first iteration compiles
-            job.begin("descend")
-        done, total = int(at.iteration), spec.tune.iterations
-        job.advance(done, total, _progress_text(spec, at), clock.left(total - done))
+            job.begin("descend", done=done)
+        job.advance(done, spec.tune.iterations, _progress_text(spec, at))
 
     at = optimise(spec, evaluator, before, keep)
     lost = [f.name for k, f in enumerate(spec.moving) if not _has_finished(at, k)]
@@ -148,21 +146,6 @@ def _tune(
     job.begin("draw")
     _write(in_folder(findings, out, out / REPORT), out)
     return findings
-
-
-class _Clock:
-    """Duration of this session's iterations; the first one compiles."""
-
-    def __init__(self) -> None:
-        self._seen: list[float] = []
-
-    def left(self, count: int) -> str:
-        """Time that so many iterations take, "" after the first or last one."""
-        self._seen.append(time.monotonic())
-        if len(self._seen) < 2 or count <= 0:
-            return ""
-        each = (self._seen[-1] - self._seen[0]) / (len(self._seen) - 1)
-        return f"at most {duration_text(count * each)}"
 
 
 def _has_finished(at: Progress, family: int) -> bool:

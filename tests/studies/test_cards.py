@@ -124,7 +124,7 @@ def test_progress_in_a_notebook_is_one_line(monkeypatch):
     with Phases(console, ("compile", "run")) as phases:
         phases.begin("run")
         console.is_jupyter = False
-        phases.advance(1, 2, "1/2 cases", "about 3 s")
+        phases.advance(1, 2, "1/2 cases", 3.0)
         phases.say("a sentence")
     assert shown[0].startswith("run (2 of 2)")
     assert shown[1] == "run (2 of 2): 1/2 cases; about 3 s left"

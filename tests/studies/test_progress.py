@@ -47,16 +47,20 @@ def test_every_phase_is_named_with_the_time_since_the_start(clock):
     ]
 
 
-def test_the_time_left_says_which_phases_it_does_not_cover():
+def test_the_time_left_says_which_phases_it_does_not_cover(clock):
+    """And counts only what this call has done."""
+
     def steps(phases):
         for name in ("run", "draw"):
-            phases.begin(name)
-            phases.advance(1, 2, "1/2", "about 5 s")
-            phases.advance(2, 2, "2/2")
+            phases.begin(name, done=3)
+            phases.advance(3, 5, "3/5")
+            clock[0] += 5.0
+            phases.advance(4, 5, "4/5", 2.0 if name == "draw" else 0.0)
+            phases.advance(5, 5, "5/5")
 
     lines = shown(steps).splitlines()
-    assert lines[1:3] == ["1/2; about 5 s left in this phase, then join, draw", "2/2"]
-    assert lines[4:] == ["1/2; about 5 s left", "2/2"]
+    assert lines[1:4] == ["3/5", "4/5; about 5 s left in this phase, then join, draw", "5/5"]
+    assert lines[5:] == ["3/5", "4/5; about 7 s left", "5/5"]
 
 
 def test_the_time_left_is_what_is_typical_times_what_this_machine_needed(clock):
@@ -109,7 +113,7 @@ def test_quiet_phases_say_nothing():
     console = Console(file=io.StringIO(), force_terminal=True)
     with Phases(console, NAMES, is_quiet=True) as phases:
         phases.begin("run")
-        phases.advance(1, 2, "1/2", "5 s")
+        phases.advance(1, 2, "1/2")
         phases.say("text")
     assert console.file.getvalue() == ""
 
