@@ -80,7 +80,7 @@ def add_verb(
     options.append(_parameter("as_json", bool, False, typer.Option("--json", help=text)))
 
     def command(precision: str = "float64", as_json: bool = False, **values: Any) -> None:
-        out, is_quiet = values.get("out"), as_json or not values.get("progress", True)
+        out = values.get("out")
         if out is not None and not values.get("dry_run"):  # before JAX starts
             if texts["out"].startswith("folder"):
                 check_folder(out)
@@ -93,7 +93,7 @@ def add_verb(
             values[name] = _taken(parameter).read(option, values[name])
         if as_json and "progress" in given:
             values["progress"] = False
-        finish(verb(**values), console, as_json, is_quiet)
+        finish(verb(**values), console, as_json)
 
     command.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     command.__annotations__ = {x.name: x.annotation for x in options}
@@ -133,13 +133,13 @@ def _parameter(name: str, kind: Any, default: Any, option: Any) -> inspect.Param
     return inspect.Parameter(name, of, default=default, annotation=Annotated[kind, option])
 
 
-def finish(result: Result, console: Console, as_json: bool, is_quiet: bool) -> None:
+def finish(result: Result, console: Console, as_json: bool) -> None:
     """Print a result, and end with 1 if it is not what one asks for."""
     from studies.show.report import print_report
 
     if as_json:
         print_document(result.document())
-    elif not is_quiet:
+    else:
         has_page = result.folder is not None and result.folder.is_dir()
         if not has_page:
             print_report(result.report(), console)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from studies.errors import StudyError
 from studies.job import KINDS
+from studies.verbs import check_file, verb
 
 if TYPE_CHECKING:
     from studies.explorer.page import Explorer
@@ -23,6 +24,7 @@ _KINDS = {
 }
 
 
+@verb
 def explore(
     what: str | Path,
     out: str | Path | None = None,
@@ -49,6 +51,7 @@ def explore(
     """
     from studies.explorer.page import write_explorer
 
+    check_file(out, ".html")
     folder = Path(what)
     kind = next((name for name in _KINDS if os.path.isfile(folder / name)), None)
     if kind is None:

@@ -239,19 +239,31 @@ def refuse_existing(path: Path, verb: str, is_resumed: bool) -> None:
     Raises:
         StudyError: they are, and are not resumed; other files; no access.
     """
-    kind = KINDS[verb]
     try:
-        is_there = any((path / mark).exists() for mark in kind.marks)
-        if not is_there and path.is_dir():
+        there = _verb_of(path, verb)
+        if not there and path.is_dir():
             _refuse_others(path)
     except OSError as error:
         raise StudyError(f"--out {path}: cannot write there ({error.strerror})") from None
-    if is_there and not is_resumed:
+    if there not in ("", verb):
+        raise StudyError(f"--out {path}: holds {KINDS[there].what}; name a new folder")
+    if there and not is_resumed:
         extend = " or to extend it" if verb == "sweep" else ""
         raise StudyError(
-            f"--out {path}: holds {kind.what} already; add --resume to go on with it{extend}, "
-            "or name a new folder"
+            f"--out {path}: holds {KINDS[verb].what} already; add --resume to go on with "
+            f"it{extend}, or name a new folder"
         )
+
+
+def _verb_of(path: Path, wanted: str) -> str:
+    """Whose results a folder holds, "" if it holds none; those wanted if that cannot be read."""
+    if (path / REQUEST).exists():
+        with suppress(OSError, ValueError, TypeError, KeyError):
+            written = read_json(path / REQUEST)["verb"]
+            return written if written in KINDS else wanted
+        return wanted
+    marks = ((verb, mark) for verb, kind in KINDS.items() for mark in kind.marks)
+    return next((verb for verb, mark in marks if (path / mark).exists()), "")
 
 
 def _refuse_others(path: Path) -> None:
@@ -294,7 +306,7 @@ def locked_folder(path: Path, verb: str) -> Iterator[None]:
     """Reserve a folder for this process, creating it if necessary.
 
     It stays reserved only as long as it has its name, see `check_reserved`. What is refused leaves
-    no trace: lock, request and folders made here go again if a StudyError ends it before anything
+    no trace: lock, request and folders made here go again if an error ends it before anything
     else is in them.
 
     Args:
@@ -329,7 +341,7 @@ def locked_folder(path: Path, verb: str) -> Iterator[None]:
         try:
             with reserving(path / LOCK, lock.fileno()):
                 yield
-        except StudyError:
+        except Exception:
             made = {path / name for name in (LOCK, *KINDS[verb].marks)}
             is_here = is_open_as(path / LOCK, lock.fileno())
             if is_here and set(path.iterdir()) - before <= made:

@@ -16,6 +16,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+import studies
 from jaxmodel.metrics import METRICS
 from studies.cli import VERBS, app
 from studies.commission.spec import Commission
@@ -102,7 +103,8 @@ def _default_of_option(parameter: Any) -> str:
 
 def verbs_text() -> str:
     """Every verb of Python with the command that is made from it."""
-    rows = ((f"`{verb.__name__}`", f"`studies.{_call(verb)}`") for verb in VERBS)
+    verbs = (verb for verb in VERBS if verb.__name__ in studies.__all__)
+    rows = ((f"`{verb.__name__}`", f"`studies.{_call(verb)}`") for verb in verbs)
     return table(("command", "verb"), rows)
 
 

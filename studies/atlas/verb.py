@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from studies.verbs import verb
+
 if TYPE_CHECKING:
     from studies.atlas.findings import AtlasFindings
     from studies.study.spec import Study
 
 
+@verb
 def atlas(
     what: Study | str | Path | None = None,
     out: str | Path | None = None,

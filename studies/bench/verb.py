@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from studies.verbs import verb
+
 if TYPE_CHECKING:
     from studies.bench.run import Benchmark
 
 
+@verb
 def bench(work: str = "", *, executor: str = "", batch: int = 0, cases: int = 0) -> Benchmark:
     """Measure speed and memory on this machine.
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from studies.verbs import verb
+
 if TYPE_CHECKING:
     from studies.commission.findings import CommissionFindings
     from studies.commission.spec import MeasuredSpec
 
 
+@verb
 def commission(
     what: MeasuredSpec | str | Path,
     out: str | Path | None = None,

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from studies.verbs import verb
+
 if TYPE_CHECKING:
     from studies.engine.design import Design
     from studies.export.comparison import ComparedVariants
@@ -12,6 +14,7 @@ if TYPE_CHECKING:
     from studies.study.spec import Study
 
 
+@verb
 def export(
     what: Design | Study | str | Path,
     out: str | Path | None = None,

@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from studies.verbs import verb
+
 if TYPE_CHECKING:
     from studies.fitting.estimate import Fitted
     from studies.fitting.spec import FitSpec
 
 
+@verb
 def fit(
     what: FitSpec | str | Path,
     out: str | Path | None = None,

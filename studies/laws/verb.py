@@ -6,12 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from studies.cluster.connect import TIMEOUT, Place
+from studies.verbs import verb
 
 if TYPE_CHECKING:
     from studies.laws.findings import LawFindings
     from studies.study.spec import Study
 
 
+@verb
 def compare(
     what: Study | str | Path,
     out: str | Path | None = None,

@@ -5,10 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from studies.verbs import verb
+
 if TYPE_CHECKING:
     from studies.papers.card import CardResult
 
 
+@verb
 def paper(
     what: str = "",
     out: str | Path | None = None,

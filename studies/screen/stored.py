@@ -131,6 +131,10 @@ def best_sweep(screen: ScreenRequest, kept: CaseTable, earlier: Sequence[Any] = 
     links = list(screen.spec.sweep.links)  # also where the designs kept control fewer
     sweep: dict[str, Any] = written | {"method": "list", "by": screen.entry, "links": links}
     sweep.pop("fidelity", None)
+    least = screen.spec.sweep.margin
+    if least:
+        own = f"({sweep['subject_to']}) and " if sweep.get("subject_to") else ""
+        sweep["subject_to"] = f"{own}gain_margin >= {least:g}"
     fields = {name: x for name, x in kept.fields.items() if name not in LABELS}
     cases = [
         {name: as_python(column[k]) for name, column in fields.items()} for k in range(len(kept))

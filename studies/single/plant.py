@@ -27,6 +27,7 @@ from studies.results.labelled import Variable, Variables, plain
 from studies.show.report import Report
 from studies.study.spec import Study
 from studies.study.state_space import FORMATS
+from studies.verbs import check_file
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,8 +177,7 @@ def write_system(system: NamedSystem, path: str | Path) -> None:
         StudyError: another ending, or a file that cannot be written.
     """
     path = Path(path)
-    if path.suffix.lower() not in FORMATS:
-        raise field_error("--out", str(path), f"a file {', '.join(FORMATS)}")
+    check_file(path, *FORMATS)
     content: dict[str, Any] = {"A": system.a, "B": system.b, "C": system.c, "D": system.d}
     content |= {"dt": system.sample_time, "inputs": system.inputs, "outputs": system.outputs}
     with replacing(path) as temporary, open(temporary, "wb") as file:

@@ -20,6 +20,7 @@ from studies.show.units import count_text
 from studies.store import write_store
 from studies.study.labels import describe
 from studies.study.spec import Study
+from studies.verbs import check_file
 
 #: Drawn next to the file of a run.
 FIGURES = ("deflection", "error", "voltage", "machine")
@@ -136,15 +137,11 @@ def check_results(out: Path, has_report: bool) -> None:
         has_report: whether its report will be written next to it.
 
     Raises:
-        StudyError: a file cannot be written, or `out` has the name of one of the report.
+        StudyError: another ending, or a file cannot be written.
     """
-    if out.suffix == ".toml":
-        raise StudyError(f"--out {out}: results are HDF5, not a study; name the file *.h5")
-    check_target(out)
+    check_file(out, ".h5", ".hdf5", ".nc")
     names = [f"{out.stem}.html", *(f"{out.stem}-{name}.png" for name in FIGURES)]
     for name in names if has_report else []:
-        if name == out.name:
-            raise StudyError(f"--out {out}: --report writes a file of this name; name it *.h5")
         check_target(out.with_name(name))
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from studies.result import in_folder
+from studies.verbs import check_file, verb
 
 if TYPE_CHECKING:
     from studies.engine.modes import NamedModes
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from studies.study.spec import Study
 
 
+@verb
 def simulate(
     what: Study | str | Path,
     out: str | Path | None = None,
@@ -48,6 +50,7 @@ def simulate(
     return simulated(what, out, case, report, margins)
 
 
+@verb
 def modes(
     what: Study | str | Path | None = None,
     out: str | Path | None = None,
@@ -90,6 +93,7 @@ def modes(
     from studies.results.document import json_text
 
     require_configured()
+    check_file(out, ".json")
     study, place = None if what is None else as_design(what).study, pose and tuple(pose)
     found = machine_modes(
         study,
@@ -107,6 +111,7 @@ def modes(
     return in_folder(found, None if out is None else Path(out))
 
 
+@verb
 def plant(
     what: Study | str | Path,
     out: str | Path | None = None,
@@ -135,8 +140,10 @@ def plant(
     from studies.config import require_configured
     from studies.engine.design import as_design
     from studies.single.plant import controller_of, plant_of, write_system
+    from studies.study.state_space import FORMATS
 
     require_configured()
+    check_file(out, *FORMATS)
     study = as_design(what, case).study
     found = controller_of(study) if controller else plant_of(study)
     if out is not None:

@@ -6,11 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from studies.verbs import verb
+
 if TYPE_CHECKING:
     from studies.spillover.certificate import Certificate
     from studies.study.spec import Study
 
 
+@verb
 def certify(
     what: Study | str | Path,
     out: str | Path | None = None,

@@ -27,7 +27,10 @@ from studies.space.spec import BlockNode
 from studies.study.margin import ENOUGH
 from studies.sweeps.records import MARGIN
 from studies.sweeps.show import label, left_out_text, recommended, shown_metric, shown_value
+from studies.verbs import check_file
 
+#: Endings of files of figures.
+FORMATS = (".png", ".pdf", ".svg")
 #: More distinct values than this are no grid.
 FEW = 60
 #: Placements drawn one below the other.
@@ -222,8 +225,7 @@ def save_plot(figure: Figure, path: Path) -> None:
     Raises:
         StudyError: another extension, or the file cannot be written.
     """
-    if path.suffix not in (".png", ".pdf", ".svg"):
-        raise StudyError(f"--out {path}; allowed: endings .png, .pdf, .svg")
+    check_file(path, *FORMATS)
     with figures.styled():
         figures.write_figure(figure, path)
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from studies.config import start
 from studies.errors import StudyError, field_error
 from studies.result import Result
+from studies.verbs import check_file, verb
 
 if TYPE_CHECKING:
     from studies.engine.results import SweepData
@@ -44,6 +45,7 @@ def _read(what: str | Path) -> SweepData:
     return data
 
 
+@verb
 def show(what: str | Path, *, failed: bool = False) -> Reading:
     """Show statuses and best cases of a sweep, or its failed cases.
 
@@ -59,6 +61,7 @@ def show(what: str | Path, *, failed: bool = False) -> Reading:
     return Reading(lambda: report(data), lambda: show_document(data, failed))
 
 
+@verb
 def best(
     what: str | Path,
     *,
@@ -107,6 +110,7 @@ def best(
     )
 
 
+@verb
 def plot(
     what: str | Path,
     out: str | Path | None = None,
@@ -126,10 +130,11 @@ def plot(
     """
     from studies.result import Summary
     from studies.show.report import listed
+    from studies.sweeps.plots import FORMATS, save_plot
     from studies.sweeps.plots import plot as draw
-    from studies.sweeps.plots import save_plot
     from studies.sweeps.show import left_out, ranking
 
+    check_file(out, *FORMATS)
     data = _read(what)
     y = y or ranking(data)
     parts = (("", y), ("-over-", x), ("-by-", hue))
@@ -142,6 +147,7 @@ def plot(
     )
 
 
+@verb
 def sensitivity(what: str | Path, *, by: str = "residual_rms") -> Reading:
     """Show which parameters matter, from a sweep with method morris or saltelli.
 

@@ -17,7 +17,7 @@ from studies.show.report import Chapter, Drawing, Items, Report, chapter, drawin
 from studies.show.units import count_text
 from studies.space.axes import SHOWN_AS
 from studies.space.methods import METHODS
-from studies.space.spec import BlockNode
+from studies.space.spec import BlockNode, SweepSpec
 from studies.space.table import case_study
 from studies.study.margin import margin_in_db
 from studies.study.template import toml_text, toml_value
@@ -57,17 +57,24 @@ def say(sweep: SweepResult) -> Report:
     data, agreed = sweep.found, None
     if data.spec.sweep.fidelity == "linear":
         agreed = agreement(data.spec, data.table, show.ranking(data))
-    report = report_of(data, str(sweep.folder), agreed)
+    asked = data.spec if sweep.screen is None else sweep.screen.screen.spec
+    report = report_of(data, str(sweep.folder), agreed, asked)
     return report if sweep.screen is None else with_screen(report, sweep.screen, data)
 
 
-def report_of(data: SweepData, folder: str = "DIR", agreed: Agreement | None = None) -> Report:
+def report_of(
+    data: SweepData,
+    folder: str = "DIR",
+    agreed: Agreement | None = None,
+    asked: SweepSpec | None = None,
+) -> Report:
     """What the cases of a sweep tell.
 
     Args:
         data: of the sweep.
         folder: of the sweep, in commands.
         agreed: how a linear sweep ranks beside the full model, if that is known.
+        asked: whose designs they are the best of; default: they are all that was asked for.
     """
     metric, spec = show.ranking(data), data.spec
     best = show.recommended(data, metric) if show.is_ranked(data, metric) else np.array([], int)
@@ -84,7 +91,7 @@ def report_of(data: SweepData, folder: str = "DIR", agreed: Agreement | None = N
         chapters=[
             _best_cases(data, metric, best),
             chapter("How the cases ended", show.status_rows(data)),
-            _varied(data),
+            _varied(data, asked or data.spec),
             _causes(data),
         ],
         files={"Sweep file": toml_text(spec.data), "Study of all cases": spec.study},
@@ -216,9 +223,9 @@ def _causes(data: SweepData) -> Chapter | None:
     )
 
 
-def _varied(data: SweepData) -> Chapter | None:
-    sweep, table, axes = data.spec.sweep, data.table, _axes(data.spec.root)
-    counts = count_text(data.n_cases, "case")
+def _varied(data: SweepData, asked: SweepSpec) -> Chapter | None:
+    sweep, table, axes = data.spec.sweep, data.table, _axes(asked.root)
+    counts = count_text(data.n_cases, "case") + ", the best of them" * (asked is not data.spec)
     if sweep.repeats > 1:
         counts += f", including {sweep.repeats} runs of each with their own noise"
     if sweep.where:
@@ -227,7 +234,7 @@ def _varied(data: SweepData) -> Chapter | None:
         counts += f"; run only once: {count_text(table.n_double, 'duplicate')}"
     return chapter(
         "What varied",
-        sentence(_method_text(data.spec.root) + (":" if axes else "")),
+        sentence(_method_text(asked.root) + (":" if axes else "")),
         Items(axes),
         f"{counts}. Seed of the design: {sweep.seed}.",
         axis_rows(table),

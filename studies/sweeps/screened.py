@@ -152,13 +152,13 @@ def margin_rows(done: ScreenOutcome) -> Rows:
 def _question(screen: ScreenRequest) -> str:
     sweep = screen.spec.sweep
     which = "largest" if sweep.by.startswith("-") else "best"
-    by = " by the linear model" if screen.is_linear else ""
-    margin = f", and a gain margin of at least {sweep.margin:g}" if sweep.margin else ""
-    met = f"; do {sweep.keep:,} of them meet {sweep.subject_to}" if sweep.subject_to else ""
+    by = f"by the {sweep.fidelity} model"
+    by += f", and a gain margin of at least {sweep.margin:g}" if sweep.margin else ""
+    by += f"; do {sweep.keep:,} of them meet {sweep.subject_to}" if sweep.subject_to else ""
     counted = counted_text(described(screen), screen.entry)
-    return f"""which of {screen.n_designs:,} designs have the {which} {screen.entry} ({counted}){by}
-    {margin}{met}? {runs_text(screen.spec.study)} Baseline: the study of the sweep file, without the
-    values of the axes."""
+    return f"""which of {screen.n_designs:,} designs have the {which} {screen.entry} ({counted})
+    {by}? {runs_text(screen.spec.study)} Baseline: the study of the sweep file,
+    without the values of the axes."""
 
 
 def _drawings(done: ScreenOutcome, data: SweepData) -> list[Drawing]:

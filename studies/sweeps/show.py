@@ -452,13 +452,13 @@ def requirement(data: SweepData, by: str, is_safe: bool = True) -> str:
     Args:
         data: the sweep.
         by: metric or entry of one.
-        is_safe: whether the gain margin counts.
+        is_safe: whether the gain margin counts, of which `sweep.subject_to` may say more.
 
     Returns:
         As much of that, as a condition, as any case with this metric meets; "" for nothing.
     """
-    is_safe = is_safe and is_there(data, MARGIN)
     own = data.spec.sweep.subject_to
+    is_safe = is_safe and is_there(data, MARGIN) and MARGIN not in own
     conditions = [x for x in (own, f"{MARGIN} >= {ENOUGH:g}" if is_safe else "") if x]
     for condition in dict.fromkeys((" and ".join(map(_bracket, conditions)), *conditions)):
         try:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from studies.cluster.connect import TIMEOUT, Place
+from studies.verbs import verb
 
 if TYPE_CHECKING:
     from studies.space.spec import SweepSpec
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from studies.sweeps.result import SweepResult
 
 
+@verb
 def sweep(
     what: SweepSpec | str | Path,
     out: str | Path | None = None,
@@ -47,7 +49,7 @@ def sweep(
     Example:
         >>> sweep("gains", "gains").best("residual_rms")  # doctest: +SKIP
     """
-    from studies.errors import StudyError
+    from studies.errors import StudyError, field_error
     from studies.job import again, checked_out, working
     from studies.publish import EXPLORER, REPORT
     from studies.result import in_folder
@@ -58,7 +60,11 @@ def sweep(
     from studies.sweeps.say import write_sweep_report
 
     spec = as_given(what, SweepSpec, load_sweep)
+    if not worker_timeout > 0:
+        raise field_error("--worker-timeout", worker_timeout, "more than 0", "s")
     if dry_run:
+        if resume and out is None:
+            raise StudyError("--resume: name the folder with --out")
         if workers is not None:
             raise StudyError("--dry-run: plans for this process only; leave the workers out")
         if report:

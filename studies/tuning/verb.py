@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from studies.cluster.connect import TIMEOUT, Place
+from studies.verbs import verb
 
 if TYPE_CHECKING:
     from studies.tuning.audit import Audit
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from studies.tuning.spec import TuneSpec
 
 
+@verb
 def tune(
     what: TuneSpec | str | Path,
     out: str | Path | None = None,

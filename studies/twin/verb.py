@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from studies.verbs import verb
+
 if TYPE_CHECKING:
     from studies.study.spec import Study
     from studies.twin.result import TwinResult
 
 
+@verb
 def twin(
     what: Study | str | Path,
     out: str | Path | None = None,

@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from studies.verbs import verb
+
 if TYPE_CHECKING:
     from studies.study.spec import Study
     from studies.verify.result import ModelVerification
 
 
+@verb
 def verify(
     what: Study | str | Path = "paper",
     out: str | Path | None = None,

@@ -11,6 +11,7 @@ import typer
 
 from studies import cli
 from studies.commands import documented
+from studies.errors import StudyError
 from studies.job import KINDS
 from tests import TOP
 
@@ -141,3 +142,27 @@ def test_a_command_has_the_options_of_its_verb(verb):
         flag = "--json" if x.name == "as_json" else f"--{x.name.replace('_', '-')}"
         assert x.opts == (["what"] if x.name == "what" else [flag]), x.name
         assert x.secondary_opts in ([], [flag.replace("--", "--no-")])
+
+
+@pytest.mark.parametrize("name", VERBS)
+def test_verbs_refuse_arguments_of_another_type_before_any_work(name, tmp_path):
+    """In Python; the command line has read them by then."""
+    verb, strange = VERBS[name], object()
+    plain = [
+        x
+        for x in arguments(verb)
+        if x.annotation.split(" | ")[0] in ("str", "bool", "int", "float")
+    ]
+    assert plain
+    for x in plain:
+        given = {"what": "paper", "out": tmp_path / "out"} | {x.name: strange}
+        with pytest.raises(
+            StudyError, match=f"^(WHAT|--{x.name.replace('_', '-')}) = .*; allowed: "
+        ):
+            verb(**given)
+        if "float" in x.annotation:
+            with pytest.raises(StudyError, match="= nan; allowed: a finite number"):
+                verb(**given | {x.name: float("nan")})
+    with pytest.raises(StudyError, match="--out = 3; allowed: a text or a path"):
+        verb("paper", 3)
+    assert not (tmp_path / "out").exists()

@@ -27,8 +27,9 @@ SHAPED = {
     "zeros",
 }
 #: Mechanisms, and what is about the 3-PRR alone: the cards of papers, the coupling atlas of its
-#: links, the same machine in other codes.
+#: links, the same machine in other codes, the paper's run.
 OF_ONE_MACHINE = (
+    "jaxmodel/defaults.py",
     "jaxmodel/mechanisms/",
     "studies/atlas/",
     "studies/papers/",
@@ -46,7 +47,7 @@ OTHERS = {
     "jaxmodel/robustness.py": ("range(6)",),
     "jaxmodel/trigonometry.py": ("range(3)",),
     "studies/cluster/connect.py": (":3", "len(faults) > 3"),
-    "studies/commission/run.py": (":3",),
+    "studies/commission/stages.py": (":3",),
     "studies/engine/disk_margin.py": (
         "_local_maxima(grid.omega, value).reshape(-1, 3)",
         "bracket.reshape(n, FOLLOWED, 3)",

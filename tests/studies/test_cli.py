@@ -237,7 +237,7 @@ def test_reports_that_cannot_be_are_refused_before_the_run(capsys, tmp_path):
     study.write_text(SHORT)
     assert "name their file with --out" in refused(capsys, "simulate", study, "--report")
     arguments = ("simulate", study, "--report", "--out")
-    assert "name it *.h5" in refused(capsys, *arguments, tmp_path / "run.html")
+    assert "allowed: a file .h5" in refused(capsys, *arguments, tmp_path / "run.html")
     (tmp_path / "run.html").mkdir()
     assert "run.html: cannot write there, it is a" in refused(
         capsys, *arguments, tmp_path / "run.h5"
@@ -363,7 +363,7 @@ def test_modes_of_a_study_are_those_of_its_own_machine(capsys, tmp_path):
     [
         (("--kp", -1), "drive.kp = -1.0; allowed: a finite number >= 0 and <= 1e+08 [N/m]"),
         (("--kp", "stiff"), "Invalid value for '--kp'"),
-        (("--kd", "inf"), "drive.kd = inf; allowed: a finite number"),
+        (("--kd", "inf"), "kd = inf; allowed: a finite number"),
         (("--damping", 1.5), "link.damping_ratio = 1.5; allowed: a finite number >= 0 and < 1,"),
         (("--n-modes", 0), "link.modes = 0; allowed: a whole number >= 1 and <= 16 [1]"),
         (("--n-modes", 17), "link.modes = 17; allowed: a whole number >= 1 and <= 16 [1]"),

@@ -132,12 +132,12 @@ def test_a_job_goes_on_only_with_what_it_was_begun_with(tmp_path):
         ({"code": "b"}, r"program \(a, now b\);"),
         ({"jaxlib": "2"}, "jaxlib"),
         ({"precision": "float32"}, r"precision \(float64, now float32\)"),
-        ({"verb": "certify"}, r"command \(fit, now certify\)"),
     ):
         with pytest.raises(StudyError, match=f"begun with another {word}"):
             begun(out, True, **other)
-    with pytest.raises(StudyError, match="holds other files"):
-        begun(out, True, "tune")
+    for verb in ("tune", "certify"):
+        with pytest.raises(StudyError, match="holds a fit; name a new folder"):
+            begun(out, True, verb)
     assert {x.name for x in out.iterdir()} == names
     for content in ("[]", "{", "\0"):
         (out / "request.json").write_text(content)

@@ -162,14 +162,16 @@ def check_uncontrolled(capsys, spec, folder):
     file = folder / BASELINE
     kept = data.baseline["residual_rms"].data
     before, whole = file.stat().st_mtime_ns, file.read_bytes()
-    assert run(capsys, "sweep", spec, "--out", folder, "--resume", "--no-progress") == (0, "", "")
+    code, said, wrong = run(capsys, "sweep", spec, "--out", folder, "--resume", "--no-progress")
+    assert (code, wrong) == (0, "") and said.startswith("0 cases in ") and said.count("\n") == 1
     assert file.stat().st_mtime_ns == before
     file.write_bytes(whole[:999])
     assert "damaged; remove it and go on with --resume" in refused(capsys, "show", folder)
     file.unlink()
     text = run(capsys, "show", folder)[1]
     assert "best cases by residual_rms" in text and "without control" not in text
-    assert run(capsys, "sweep", spec, "--out", folder, "--resume", "--no-progress") == (0, "", "")
+    code, said, wrong = run(capsys, "sweep", spec, "--out", folder, "--resume", "--no-progress")
+    assert (code, wrong) == (0, "") and said.startswith("0 cases in ") and said.count("\n") == 1
     np.testing.assert_array_equal(read_sweep(folder).baseline["residual_rms"].data, kept)
 
 
