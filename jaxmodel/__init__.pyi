@@ -2,7 +2,10 @@ from .bases import find_bases
 from .beam import BASES, build_basis
 from .case import Case, Structure
 from .control import efficient_modal_control, pole_placement
+from .defaults import paper_case, with_values
 from .dynamics import accelerations, kinetic_energy, potential_energy
+from .equations import equations_of_motion, lumped_forces
+from .judge import judge
 from .kinematics import close_chain, inverse_kinematics
 from .linear import frequency_response, linearise, natural_modes
 from .loop import step
@@ -27,16 +30,21 @@ __all__ = [
     "closed_loop",
     "command",
     "efficient_modal_control",
+    "equations_of_motion",
     "find_bases",
     "frequency_response",
     "inverse_kinematics",
+    "judge",
     "kinetic_energy",
     "linearise",
+    "lumped_forces",
     "natural_modes",
+    "paper_case",
     "paper_machine",
     "pole_placement",
     "potential_energy",
     "prepare",
     "simulate",
     "step",
+    "with_values",
 ]

@@ -17,7 +17,7 @@ from jaxmodel.damping import damping_ratios
 from jaxmodel.drives import DRIVES
 from jaxmodel.gain_margin import fold_frequency, gain_margins
 from jaxmodel.laws import LAWS
-from jaxmodel.lazy import jax, jnp
+from jaxmodel.lazy import compiled, jax, jnp
 from jaxmodel.loop_figures import MARGIN_MODES
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
@@ -81,6 +81,7 @@ def can_judge(structure: Structure) -> bool:
     return structure.feedback == "sampled" and is_by_link and has_plain_drive
 
 
+@compiled("structure", "steps", "n_active")
 def judge(
     structure: Structure, cases: Case, steps: Steps = scan_steps, n_active: int | None = None
 ) -> LoopVerdicts:
@@ -91,16 +92,23 @@ def judge(
 
     Args:
         structure: static choices of the runs, of which `can_judge` holds.
-        cases: leaves (n, ...).
+        cases: leaves (n, ...), or one case; give many whole, not by `vmap`.
         steps: runs elementwise steps.
         n_active: links under control at most (static); default: all.
 
     Returns:
-        LoopVerdicts, with NaN where a number of the loop is not finite.
+        LoopVerdicts, with NaN where a number of the loop is not finite; of one case without its
+        axis n.
 
     Example:
-        >>> judged = jax.jit(partial(judge, structure))(cases)  # doctest: +SKIP
+        >>> structure, case = paper_case(n_modes=2)
+        >>> float(jax.jit(judge, static_argnums=0)(structure, case).gain_margin) > 1
+        True
     """
+    if np.ndim(cases.seed) == 0:
+        many = jax.tree.map(lambda x: jnp.asarray(x)[None], cases)
+        alone: LoopVerdicts = jax.tree.map(lambda x: x[0], judge(structure, many, steps, n_active))
+        return alone
     structure, cases = with_margin_modes(structure, cases)
     response, modes, strength = jax.vmap(partial(_respond, structure), out_axes=-1)(cases)
     mask = cases.control.link_mask.T

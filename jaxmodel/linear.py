@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxmodel.axial import axial_force, held_coordinates
 from jaxmodel.case import MOTOR_ORDER, Case, Structure
+from jaxmodel.checks import check_shape
 from jaxmodel.drive import Reference, motor_force, settled_motors, slider_force
 from jaxmodel.drives import DRIVES
 from jaxmodel.dynamics import inverse_dynamics, kinetic_energy, modal_chain
@@ -94,6 +95,7 @@ def linearise(
     Returns:
         LinearPlant.
     """
+    check_shape("pose", pose, (structure.n_pose,))
     # friction counts as nothing here: it damps small motion most, the safe side
     loop = loop._replace(plant=loop.plant._replace(joint_friction=None))
     pose = jnp.asarray(pose, loop.omega.dtype)
@@ -181,13 +183,20 @@ def _diagonal(matrix: Array) -> Array:
     return jnp.einsum("imr,il->imlr", matrix, jnp.eye(links)).reshape(links * m, links * n)
 
 
+def places_and_rates(plant: LinearPlant) -> tuple[np.ndarray, np.ndarray]:
+    """Where (X, q) and (X', q') are in x."""
+    pose = plant.force.shape[1]  # as many joints as pose coordinates
+    first, modes = 2 * pose, (plant.state.shape[0] - n_motors(plant)) // 2 - pose
+    return (
+        np.r_[0:pose, first : first + modes],
+        np.r_[pose:first, first + modes : first + 2 * modes],
+    )
+
+
 def mechanical(plant: LinearPlant) -> Array:
     """A with rows and columns in the order (X, q, X', q') and, if they are late, motors."""
-    pose, motors = plant.force.shape[1], n_motors(plant)  # as many joints as pose coordinates
-    first, modes = 2 * pose, (plant.state.shape[0] - motors) // 2 - pose
-    position = np.r_[0:pose, first : first + modes]
-    velocity = np.r_[pose:first, first + modes : first + 2 * modes]
-    index = np.r_[position, velocity, first + 2 * modes : plant.state.shape[0]]
+    size = plant.state.shape[0]
+    index = np.r_[(*places_and_rates(plant), slice(size - n_motors(plant), size))]
     return plant.state[np.ix_(index, index)]
 
 

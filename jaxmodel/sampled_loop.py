@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxmodel.case import Case, Structure
+from jaxmodel.checks import check_shape
 from jaxmodel.controller import Controller, controller_step, rest_controller, with_gains
 from jaxmodel.delay import LONGEST, command_change, true_delay
 from jaxmodel.drive import Reference, drive_step
@@ -47,6 +48,14 @@ class LoopMatrices(NamedTuple):
     # speeds [m/s], (n, 2 l); None: the drive acts in continuous time
     reference: Array | None = None
 
+    def state_space(self, factor: Array = 1.0) -> tuple[Array, Array, Array, Array]:
+        """A, B, C, D per sample, from forces on the actuated joints to chord deflections.
+
+        factor: on all gains.
+        """
+        direct = jnp.zeros((len(self.deflection), self.force.shape[1]), self.force.dtype)
+        return self.open + factor * self.feedback, self.force, self.deflection, direct
+
 
 @compiled("structure")
 def closed_loop(
@@ -68,6 +77,7 @@ def closed_loop(
     Returns:
         LoopMatrices.
     """
+    check_shape("pose", pose, (structure.n_pose,))
     smooth = structure._replace(is_smooth=True, feedback="sampled")
     loop = prepare(smooth, case).loop
     law = loop.controller if law is None else law
