@@ -7,17 +7,18 @@ from typing import NamedTuple
 from jaxmodel.electronics import Amplifier
 from jaxmodel.hysteresis import Hysteresis, added_voltage, advance_plays
 from jaxmodel.lazy import jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 
 
 class Acting(NamedTuple):
     """How actuators act over a plant step: as if held + remainder exp(-t/lag) were on them."""
 
-    held: Array  # [V], (3, K)
-    remainder: Array | None  # [V], (3, K); None: no amplifiers
-    course: tuple[Array, Array, Array]  # at start, middle and end [V], (3, K) each
-    voltage: Array | None  # on them at the end [V], (3, K); None: no amplifiers
-    plays: Array | None  # of their hysteresis at the end [V], (N, 3, K)
+    held: Num[Array, "links K"]  # [V]
+    remainder: Num[Array, "links K"] | None  # [V]; None: no amplifiers
+    # at start, middle and end [V]
+    course: tuple[Num[Array, "links K"], Num[Array, "links K"], Num[Array, "links K"]]
+    voltage: Num[Array, "links K"] | None  # on them at the end [V]; None: no amplifiers
+    plays: Num[Array, "N links K"] | None  # of their hysteresis at the end [V]
 
 
 def act(

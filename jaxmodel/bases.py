@@ -7,17 +7,17 @@ from typing import NamedTuple
 from jaxmodel.beam import ModalBasis, build_basis, held_frequency, map_modes, mask_modes
 from jaxmodel.case import Case, Structure
 from jaxmodel.lazy import compiled, jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 
 
 class Bases(NamedTuple):
     """Bases of the links and of the controller's model."""
 
     plant: ModalBasis  # R modes
-    at_load: Array  # deflection of the plant's modes at the static load [1], (3, R)
-    plant_omega: Array  # frequencies of the links between held ends [rad/s], (3, C)
+    at_load: Num[Array, "links R"]  # deflection of the plant's modes at the static load [1]
+    plant_omega: Num[Array, "links C"]  # frequencies of the links between held ends [rad/s]
     model: ModalBasis  # the controller's model, max(R, C) modes
-    believed_omega: Array  # what its filters and shaper are designed for [rad/s], (3, C)
+    believed_omega: Num[Array, "links C"]  # what its filters and shaper are designed for [rad/s]
 
 
 @compiled("structure")

@@ -20,7 +20,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from jaxmodel.lazy import jax, jnp
-from jaxmodel.parameters import Array, Beam, Patches
+from jaxmodel.parameters import Array, Beam, Num, Patches
 from jaxmodel.piezo import bare_stiffness, opposite_gain, patch_ends
 from jaxmodel.static import (
     Pieces,
@@ -37,33 +37,36 @@ _Parts = TypeVar("_Parts", Beam, Patches)
 
 
 class ModalBasis(NamedTuple):
-    """What the dynamics needs to know about three links with R modes each."""
+    """What the dynamics needs to know about links with R modes each."""
 
-    # m_j = int rhoA Y_j^2 [kg], (3, R); shapes are scaled so that it is the same for every mode
-    mass: Array
-    stiffness: Array  # k_j [N/m], (3, R)
-    tip: Array | None  # Y_j(L) [1], (3, R); None where it is zero for every mode
+    # m_j = int rhoA Y_j^2 [kg]; shapes are scaled so that it is the same for every mode
+    mass: Num[Array, "links R"]
+    stiffness: Num[Array, "links R"]  # k_j [N/m]
+    tip: Num[Array, "links R"] | None  # Y_j(L) [1]; None where it is zero for every mode
     # S_jk = int Y_j' Y_k' dx: a bent link's chord is shorter than the link by 1/2 sum S_jk q_j q_k
-    shortening: Array | None  # S_jj [1/m], (3, R); None where the ends are not on the chord
-    mixed_shortening: Array | None  # S_jk, zero for j = k [1/m], (3, R, R); None where all zero
+    shortening: Num[Array, "links R"] | None  # S_jj [1/m]; None where the ends are not on the chord
+    # S_jk, zero for j = k [1/m]; None where all zero
+    mixed_shortening: Num[Array, "links R R"] | None
     # a point at x moves inwards by 1/2 int_0^x w'^2; with the mass and first moment beyond x,
     # m_>(x) = int_x^L rhoA and J_>(x) = int_x^L rhoA x:
-    inward: Array | None  # P_jk = int Y_j' Y_k' m_> dx [kg/m], (3, R, R); None as `shortening`
-    centrifugal: Array | None  # Q_jk = int Y_j' Y_k' J_> dx [kg], (3, R, R); None as `shortening`
-    b: Array  # int rhoA Y_j [kg], (3, R)
-    c: Array  # int rhoA x Y_j (and joint inertia) [kg m], (3, R)
-    link_mass: Array  # m_b [kg], (3,)
-    first_moment: Array  # e = int rhoA x [kg m], (3,)
-    inertia: Array  # J0 = int rhoA x^2 + J_B + J_C [kg m2], (3,)
-    deflection_at: Array  # Y_j at `stations` minus the chord's (x/L) Y_j(L) [1], (3, S, R)
-    sensor_slope: Array  # Phi_s: Y_j' at right minus left sensor end [1/m], (3, R, n_patches)
-    actuator_slope: Array  # Phi_a: the same for the actuators [1/m], (3, R, n_patches)
-    end_slope: Array  # Y_j' at both ends [1/m], (3, R, 2)
+    # P_jk = int Y_j' Y_k' m_> dx [kg/m]; None as `shortening`
+    inward: Num[Array, "links R R"] | None
+    # Q_jk = int Y_j' Y_k' J_> dx [kg]; None as `shortening`
+    centrifugal: Num[Array, "links R R"] | None
+    b: Num[Array, "links R"]  # int rhoA Y_j [kg]
+    c: Num[Array, "links R"]  # int rhoA x Y_j (and joint inertia) [kg m]
+    link_mass: Num[Array, "links"]  # m_b [kg]
+    first_moment: Num[Array, "links"]  # e = int rhoA x [kg m]
+    inertia: Num[Array, "links"]  # J0 = int rhoA x^2 + J_B + J_C [kg m2]
+    deflection_at: Num[Array, "links S R"]  # Y_j at `stations` minus the chord's (x/L) Y_j(L) [1]
+    sensor_slope: Num[Array, "links R K"]  # Phi_s: Y_j' at right minus left sensor end [1/m]
+    actuator_slope: Num[Array, "links R K"]  # Phi_a: the same for the actuators [1/m]
+    end_slope: Num[Array, "links R 2"]  # Y_j' at both ends [1/m]
     # exact static response to moments of the actuators, whatever the modes (`jaxmodel.static`)
-    static_slope: Array  # slope differences over the sensors [rad/(N m)], (3, n_patches, n_patches)
-    static_deflection: Array  # from the chord at `stations` [m/(N m)], (3, S, n_patches)
-    # elongation of a link per last coordinate, if that is no mode [1], (3,); None: all are modes
-    stretch: Array | None = None
+    static_slope: Num[Array, "links K K"]  # slope differences over the sensors [rad/(N m)]
+    static_deflection: Num[Array, "links S K"]  # from the chord at `stations` [m/(N m)]
+    # elongation of a link per last coordinate, if that is no mode [1]; None: all are modes
+    stretch: Num[Array, "links"] | None = None
 
 
 class Basis(NamedTuple):
@@ -303,10 +306,10 @@ def _pinned_free(beam: Beam, patches: Patches, n_modes: int, stations: Array) ->
 
 
 class _Shapes(NamedTuple):
-    """Ritz functions at some points, as functions of xi = x/L, (functions, points) each."""
+    """Ritz functions at some points, as functions of xi = x/L."""
 
-    value: Array
-    slope: Array
+    value: Num[Array, "functions points"]
+    slope: Num[Array, "functions points"]
 
 
 def _smooth_shapes(xi: Array, n_sines: int) -> _Shapes:
@@ -338,7 +341,7 @@ class _Bends(NamedTuple):
     """
 
     pieces: Pieces  # their ends as shares of the link's length [1]
-    curvature: Array  # of each function on each piece [1], (2 K, n)
+    curvature: Num[Array, "2*K n"]  # of each function on each piece [1]
 
 
 def _bends(pieces: Pieces, length: Array) -> _Bends:
@@ -401,7 +404,7 @@ class _Integrals(NamedTuple):
 
     sine: Array  # `_moments` of twice as many harmonics as there are sines
     cosine: Array
-    power: Array  # int xi^d dxi over each piece, d = 0.. 6, (n, 7)
+    power: Num[Array, "n 7"]  # int xi^d dxi over each piece, d = 0.. 6
 
     def single(self, factor: Array, sines: np.ndarray, rest: Array) -> Array:
         """int f y dxi, f (n, W), of sines of these sizes and polynomials (m, n, D), (n_s + m,)."""

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from jaxmodel.lazy import jnp
 from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.motion import Path
-from jaxmodel.parameters import Array, Machine
+from jaxmodel.parameters import Array, Machine, Num, PerLink
 from jaxmodel.state_space import StateSpace
 
 #: States of a motor that follows late.
@@ -106,112 +106,115 @@ class Structure(NamedTuple):
 class Control(NamedTuple):
     """Controller settings; masks are 1 or 0."""
 
-    n_active: Array  # number of controlled modes, ()
-    link_mask: Array  # controlled links, (3,)
-    mode_mask: Array  # controlled modes of each link, (3, C)
-    omega: Array  # nominal frequencies of the assembled links [rad/s]; 0: its basis's, (3, C)
-    velocity_gain: Array  # k_d of mode 1 [N s/m] or [1/s], (3,); SRF: [s]
-    position_gain: Array  # k_p of mode 1 [N/m] or [1/s2], (3,); SRF: [1]
-    ratio: Array  # EMC ratios (24) [1], (3, C)
-    damping: Array  # added damping ratio specified [1]; negative: none, (3, C)
-    pole_decay: Array  # alpha-bar asked [1/s]; 0: none asked, (3, C)
-    pole_frequency: Array  # beta-bar asked [rad/s]; 0: the mode's own, (3, C)
-    gain_factor: Array  # factor on the loop gain, whatever the law [1], ()
-    is_per_mass: Array  # 1: gains in 1/s and 1/s2, 0: in N s/m and N/m, ()
-    feedthrough_factor: Array  # share of the residual modes' feed-through compensated [1], ()
-    notch: Array  # frequency of the links' notch filters [rad/s]; 0: none, (3,)
-    notch_depth: Array  # their gain there [1], (3,)
-    notch_width: Array  # stop band over frequency [1], (3,)
-    parameters: dict[str, Array]  # the law's own, by name, (3,) each
+    n_active: Num[Array, ""]  # number of controlled modes
+    link_mask: Num[Array, "links"]  # controlled links
+    mode_mask: Num[Array, "links C"]  # controlled modes of each link
+    # nominal frequencies of the assembled links [rad/s]; 0: its basis's
+    omega: Num[Array, "links C"]
+    velocity_gain: Num[Array, "links"]  # k_d of mode 1 [N s/m] or [1/s]; SRF: [s]
+    position_gain: Num[Array, "links"]  # k_p of mode 1 [N/m] or [1/s2]; SRF: [1]
+    ratio: Num[Array, "links C"]  # EMC ratios (24) [1]
+    damping: Num[Array, "links C"]  # added damping ratio specified [1]; negative: none
+    pole_decay: Num[Array, "links C"]  # alpha-bar asked [1/s]; 0: none asked
+    pole_frequency: Num[Array, "links C"]  # beta-bar asked [rad/s]; 0: the mode's own
+    gain_factor: Num[Array, ""]  # factor on the loop gain, whatever the law [1]
+    is_per_mass: Num[Array, ""]  # 1: gains in 1/s and 1/s2, 0: in N s/m and N/m
+    feedthrough_factor: Num[Array, ""]  # share of the residual modes' feed-through compensated [1]
+    notch: Num[Array, "links"]  # frequency of the links' notch filters [rad/s]; 0: none
+    notch_depth: Num[Array, "links"]  # their gain there [1]
+    notch_width: Num[Array, "links"]  # stop band over frequency [1]
+    parameters: dict[str, Num[Array, "links"]]  # the law's own, by name
     system: StateSpace | None = None  # controller from a file
 
 
 class Electronics(NamedTuple):
     """Sampling, converters and the velocity estimate."""
 
-    period: Array  # T [s], ()
-    antialias: Array  # corner of the Butterworth filter [rad/s], ()
-    sensor_highpass: Array  # corner 1/(R C) of a patch into its amplifier [rad/s], ()
-    amplifier_lag: Array  # time constant of the actuators' amplifiers [s], ()
-    delay: Array  # from a sample to its command on the actuators [samples], ()
-    unmodelled_delay: Array  # more of it, which the controller does not know [samples], ()
-    conditioner_gain: Array  # ADC volt per sensor volt [1], ()
-    conditioner_bias: Array  # [V], ()
-    adc_range: Array  # full scale, from 0 [V], ()
-    adc_levels: Array  # 2^bits [1], ()
-    adc_noise: Array  # rms, at the ADC input [V], ()
-    voltage_limit: Array  # actuator limit [V], ()
-    estimator: Array  # index in `estimator.KINDS`, ()
-    highpass: Array  # [rad/s], ()
-    lowpass_ratio: Array  # kappa [1], (C,)
-    lowpass_zeta: Array  # [1], (C,)
-    difference_cutoff: Array  # [rad/s], ()
+    period: Num[Array, ""]  # T [s]
+    antialias: Num[Array, ""]  # corner of the Butterworth filter [rad/s]
+    sensor_highpass: Num[Array, ""]  # corner 1/(R C) of a patch into its amplifier [rad/s]
+    amplifier_lag: Num[Array, ""]  # time constant of the actuators' amplifiers [s]
+    delay: Num[Array, ""]  # from a sample to its command on the actuators [samples]
+    unmodelled_delay: Num[Array, ""]  # more of it, which the controller does not know [samples]
+    conditioner_gain: Num[Array, ""]  # ADC volt per sensor volt [1]
+    conditioner_bias: Num[Array, ""]  # [V]
+    adc_range: Num[Array, ""]  # full scale, from 0 [V]
+    adc_levels: Num[Array, ""]  # 2^bits [1]
+    adc_noise: Num[Array, ""]  # rms, at the ADC input [V]
+    voltage_limit: Num[Array, ""]  # actuator limit [V]
+    estimator: Num[Array, ""]  # index in `estimator.KINDS`
+    highpass: Num[Array, ""]  # [rad/s]
+    lowpass_ratio: Num[Array, "C"]  # kappa [1]
+    lowpass_zeta: Num[Array, "C"]  # [1]
+    difference_cutoff: Num[Array, ""]  # [rad/s]
 
 
 class Shaping(NamedTuple):
     """Input shaper of the reference, one entry per shaped frequency."""
 
-    kind: Array  # position in `shaper.SHAPERS`, ()
-    omega: Array  # [rad/s], 0: mode 1 of the nominal model, (n,)
-    zeta: Array  # [1], (n,)
-    tolerance: Array  # V of the EI family [1], ()
-    is_exact: Array  # 1: impulses split exactly for their mode, 0: linearly, ()
+    kind: Num[Array, ""]  # position in `shaper.SHAPERS`
+    omega: Num[Array, "n"]  # [rad/s], 0: mode 1 of the nominal model
+    zeta: Num[Array, "n"]  # [1]
+    tolerance: Num[Array, ""]  # V of the EI family [1]
+    is_exact: Num[Array, ""]  # 1: impulses split exactly for their mode, 0: linearly
 
 
 class Drive(NamedTuple):
-    """Drives and their disturbances; (3,) or ()."""
+    """Drives and their disturbances."""
 
-    kp: Array  # [N/m]
-    kd: Array  # [N s/m]
-    model_mass: Array  # platform and payload that computed torque assumes, over the true [1], ()
-    force_limit: Array  # [N]
-    coulomb_friction: Array  # [N]
-    friction_speed: Array  # speed of the tanh [m/s]
-    viscous_friction: Array  # [N s/m]
-    lag: Array  # dead time from a command to the motors' force [s], ()
-    ripple: Array  # seeded force ripple, rms [N]
-    pulse_force: Array  # disturbance [N], (3,)
-    pulse_start: Array  # [s], ()
-    pulse_length: Array  # [s], ()
-    is_locked: Array  # 1: drives held (bases with Y(L) = 0), ()
-    parameters: dict[str, Array]  # the drive's own, by name
+    kp: PerLink  # [N/m]
+    kd: PerLink  # [N s/m]
+    # platform and payload that computed torque assumes, over the true [1]
+    model_mass: Num[Array, ""]
+    force_limit: PerLink  # [N]
+    coulomb_friction: PerLink  # [N]
+    friction_speed: PerLink  # speed of the tanh [m/s]
+    viscous_friction: PerLink  # [N s/m]
+    lag: Num[Array, ""]  # dead time from a command to the motors' force [s]
+    ripple: PerLink  # seeded force ripple, rms [N]
+    pulse_force: Num[Array, "links"]  # disturbance [N]
+    pulse_start: Num[Array, ""]  # [s]
+    pulse_length: Num[Array, ""]  # [s]
+    is_locked: Num[Array, ""]  # 1: drives held (bases with Y(L) = 0)
+    parameters: dict[str, PerLink]  # the drive's own, by name
 
 
 class Load(NamedTuple):
     """Force and moment on the platform at its reference point [N, N, N m]."""
 
-    wrench: Array  # steady; the run starts in equilibrium with it, (3,)
-    pulse: Array  # disturbance on top, (3,)
-    pulse_start: Array  # [s], ()
-    pulse_length: Array  # [s], ()
+    wrench: Num[Array, "pose"]  # steady; the run starts in equilibrium with it
+    pulse: Num[Array, "pose"]  # disturbance on top
+    pulse_start: Num[Array, ""]  # [s]
+    pulse_length: Num[Array, ""]  # [s]
 
 
 class Initial(NamedTuple):
     """State at t = 0 beyond rest at the first way-point."""
 
-    modal: Array  # q [m], (3, R)
-    load_station: Array  # where a static transverse load bends the links [m], ()
-    load_deflection: Array  # chord deflection there [m], (3,)
+    modal: Num[Array, "links R"]  # q [m]
+    load_station: Num[Array, ""]  # where a static transverse load bends the links [m]
+    load_deflection: Num[Array, "links"]  # chord deflection there [m]
 
 
 class Windows(NamedTuple):
     """Windows, limits and stations of the metrics."""
 
-    residual_delay: Array  # from the end of the shaped command [s], ()
-    residual_length: Array  # [s], ()
-    settling_band: Array  # chord deflection [m], ()
-    saturation_limit: Array  # tolerated fraction of saturated samples [1], ()
-    arrival_tolerance: Array  # tolerated rms error of a joint's place in the window [m], ()
-    singularity_margin: Array  # tolerated distance of link angles from 0 and 90 deg [rad], ()
-    condition_limit: Array  # tolerated condition number [1], ()
-    stations: Array  # where chord deflection is taken, over the links' lengths [1], (S,) or (3, S)
+    residual_delay: Num[Array, ""]  # from the end of the shaped command [s]
+    residual_length: Num[Array, ""]  # [s]
+    settling_band: Num[Array, ""]  # chord deflection [m]
+    saturation_limit: Num[Array, ""]  # tolerated fraction of saturated samples [1]
+    arrival_tolerance: Num[Array, ""]  # tolerated rms error of a joint's place in the window [m]
+    singularity_margin: Num[Array, ""]  # tolerated distance of link angles from 0 and 90 deg [rad]
+    condition_limit: Num[Array, ""]  # tolerated condition number [1]
+    # where chord deflection is taken, over the links' lengths [1]
+    stations: Num[Array, "S"] | Num[Array, "links S"]
 
 
 class Case(NamedTuple):
     """Every number of one closed-loop run."""
 
     machine: Machine
-    n_modes: Array  # plant modes per link in use, ()
+    n_modes: Num[Array, ""]  # plant modes per link in use
     path: Path
     shaping: Shaping
     control: Control
@@ -220,7 +223,7 @@ class Case(NamedTuple):
     load: Load
     initial: Initial
     windows: Windows
-    seed: Array  # of ADC noise and ripple, ()
+    seed: Num[Array, ""]  # of ADC noise and ripple
 
 
 def uncontrolled(case: Case) -> Case:

@@ -15,7 +15,7 @@ from jaxmodel.controller import Controller
 from jaxmodel.lazy import jnp
 from jaxmodel.linear import resting
 from jaxmodel.loop import coordinate_omega
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import loop_matrices
 
@@ -26,14 +26,14 @@ class MachineChange(NamedTuple):
     Relative changes are natural logarithms of the factor, so that no factor becomes negative.
     """
 
-    stiffness: Array  # ln of the factor on E I of each link [1], (3,)
-    damping: Array  # ln of the factor on the damping ratios of each link [1], (3,)
-    payload: Array  # mass added at the platform's reference point [kg], ()
-    patch: Array  # how far each pair of patches moves towards joint C [m], (3, K)
-    delay: Array  # extra delay of the actuators, 0 or more [samples], ()
-    actuator: Array  # ln of the factor on each actuator's voltage [1], (3, K)
-    sensor: Array  # ln of the factor on each sensor's voltage [1], (3, K)
-    joint_inertia: Array  # added at the platform joint of each link [kg m2], (3,)
+    stiffness: Num[Array, "links"]  # ln of the factor on E I of each link [1]
+    damping: Num[Array, "links"]  # ln of the factor on the damping ratios of each link [1]
+    payload: Num[Array, ""]  # mass added at the platform's reference point [kg]
+    patch: Num[Array, "links K"]  # how far each pair of patches moves towards joint C [m]
+    delay: Num[Array, ""]  # extra delay of the actuators, 0 or more [samples]
+    actuator: Num[Array, "links K"]  # ln of the factor on each actuator's voltage [1]
+    sensor: Num[Array, "links K"]  # ln of the factor on each sensor's voltage [1]
+    joint_inertia: Num[Array, "links"]  # added at the platform joint of each link [kg m2]
 
 
 def changed_case(case: Case, change: MachineChange) -> Case:

@@ -13,20 +13,20 @@ import numpy as np
 
 from jaxmodel.estimator import Estimator, FilterState, advance_filters, weighted
 from jaxmodel.lazy import jax, jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 
 
 class Channels(NamedTuple):
     """Coefficients of the channels of each link."""
 
-    filter: Array  # channels from sensor voltages [m/V] (SRF: identity), (3, C, K)
-    estimator: Estimator  # (3, C) each
-    velocity_gain: Array  # [N s/m] (SRF: [s]), (3, C)
-    position_gain: Array | None  # [N/m] (SRF: [1]), (3, C), None if there is none
-    synthesizer: Array  # voltages from channel forces [V/N] (SRF: identity), (3, K, C)
-    # [rad/s], (3, C): among a link's channels with a value above 0, only the one of highest modal
+    filter: Num[Array, "links C K"]  # channels from sensor voltages [m/V] (SRF: identity)
+    estimator: Estimator
+    velocity_gain: Num[Array, "links C"]  # [N s/m] (SRF: [s])
+    position_gain: Num[Array, "links C"] | None  # [N/m] (SRF: [1]), None if there is none
+    synthesizer: Num[Array, "links K C"]  # voltages from channel forces [V/N] (SRF: identity)
+    # [rad/s]: among a link's channels with a value above 0, only the one of highest modal
     # energy acts (modified IMSC); None: all act
-    rival_omega: Array | None = None
+    rival_omega: Num[Array, "links C"] | None = None
 
     @property
     def acting(self) -> np.ndarray:

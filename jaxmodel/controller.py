@@ -15,7 +15,7 @@ from jaxmodel.channels import Channels
 from jaxmodel.estimator import FilterState
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.notch import Notch, NotchState, advance_notch
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.state_space import StateSpace
 
 #: From sensor to actuator voltages, in either form; both have the same methods.
@@ -26,21 +26,21 @@ class Controller(NamedTuple):
     """Coefficients, computed once per case."""
 
     feedback: Feedback
-    feedthrough: Array  # sensor volts per actuator volt to subtract [1], (3, K, K)
-    voltage_limit: Array  # [V], ()
-    adc_gain: Array  # conditioner gain [1], ()
-    adc_bias: Array  # [V], ()
-    adc_step: Array  # one code [V], ()
-    adc_top: Array  # highest code [1], ()
-    adc_noise: Array  # rms at the ADC input [V], ()
+    feedthrough: Num[Array, "links K K"]  # sensor volts per actuator volt to subtract [1]
+    voltage_limit: Num[Array, ""]  # [V]
+    adc_gain: Num[Array, ""]  # conditioner gain [1]
+    adc_bias: Num[Array, ""]  # [V]
+    adc_step: Num[Array, ""]  # one code [V]
+    adc_top: Num[Array, ""]  # highest code [1]
+    adc_noise: Num[Array, ""]  # rms at the ADC input [V]
     notch: Notch | None = None  # before the feedback; None: there is none
 
 
 class ChannelParts(NamedTuple):
     """What the channels of a controller read and drive; a linear system has none, C = 0."""
 
-    filter: Array  # channel signal per sensor volt, (n, C, K)
-    synthesizer: Array  # actuator volts per channel force, (n, K, C)
+    filter: Num[Array, "n C K"]  # channel signal per sensor volt
+    synthesizer: Num[Array, "n K C"]  # actuator volts per channel force
 
 
 def channel_parts(controller: Controller) -> ChannelParts:
@@ -55,17 +55,18 @@ def channel_parts(controller: Controller) -> ChannelParts:
 class ControllerState(NamedTuple):
     """What the controller remembers from sample to sample."""
 
-    feedback: FilterState | Array  # of channels, or of a linear system, (G, N, b)
-    voltage: Array  # command applied during this sample, computed in the last one [V], (3, K)
+    feedback: FilterState | Num[Array, "G N b"]  # of channels, or of a linear system
+    # command applied during this sample, computed in the last one [V]
+    voltage: Num[Array, "links K"]
     notch: NotchState | None = None
 
 
 class ControllerInfo(NamedTuple):
     """Diagnostics of one sample."""
 
-    measured: Array  # sensor voltage as the controller sees it [V], (3, K)
-    command: Array  # new command, applied from the next sample on [V], (3, K)
-    is_clipped: Array  # ADC at the end of its range, 0 or 1 per channel, (3, K)
+    measured: Num[Array, "links K"]  # sensor voltage as the controller sees it [V]
+    command: Num[Array, "links K"]  # new command, applied from the next sample on [V]
+    is_clipped: Num[Array, "links K"]  # ADC at the end of its range, 0 or 1 per channel
 
 
 def rest_controller(controller: Controller) -> ControllerState:

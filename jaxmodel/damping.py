@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.pairs import Pair
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.return_difference import (
     AssembledModes,
     LoopResponse,
@@ -150,7 +150,7 @@ class OrderPoles(NamedTuple):
 
     pole: Pair  # s [1/s], (n,)
     shift: Pair  # exp(-s T), (n,)
-    step: Array  # size of the last step over that of the pole [1], (n,)
+    step: Num[Array, "n"]  # size of the last step over that of the pole [1]
 
 
 def refine_open_loop_poles(

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from jaxmodel.case import Electronics
 from jaxmodel.lazy import jax, jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 
 #: Longest delay [samples].
 LONGEST = 4
@@ -21,9 +21,9 @@ LONGEST = 4
 class CommandChange(NamedTuple):
     """Which commands u_(k-j), j = 0 to `LONGEST`, a sample has, and when they change."""
 
-    before: Array  # 1 for the one until the change, else 0, (LONGEST + 1,)
-    after: Array  # the same from the change on, (LONGEST + 1,)
-    share: Array  # of the sample until the change, 0 to 1 [1], ()
+    before: Num[Array, "J"]  # 1 for the one until the change, else 0
+    after: Num[Array, "J"]  # the same from the change on
+    share: Num[Array, ""]  # of the sample until the change, 0 to 1 [1]
 
 
 def command_change(delay: Array) -> CommandChange:

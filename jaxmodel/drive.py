@@ -9,20 +9,20 @@ from jaxmodel.controller import soft_limit
 from jaxmodel.drives import DRIVES
 from jaxmodel.drives.contract import DriveState, SliderError, drive_force
 from jaxmodel.lazy import jax, jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 
 
 class Reference(NamedTuple):
-    """Desired motion of the actuated joints at one instant, (3,) each."""
+    """Desired motion of the actuated joints at one instant."""
 
-    rho: Array  # [m]
-    rho_rate: Array  # [m/s]
-    feedforward: Array | None  # computed torque, or what holds a steady load [N]
-    disturbance: Array  # external force, held over the sample [N]
-    wrench: Array | None = None  # on the platform, held over the sample [N, N, N m]
+    rho: Num[Array, "links"]  # [m]
+    rho_rate: Num[Array, "links"]  # [m/s]
+    feedforward: Num[Array, "links"] | None  # computed torque, or what holds a steady load [N]
+    disturbance: Num[Array, "links"]  # external force, held over the sample [N]
+    wrench: Num[Array, "pose"] | None = None  # on the platform, held over the sample [N, N, N m]
     # what a sampled drive feeds back, held over the sample [N]; None: the drive, or a sampled one
     # to first order, acts in continuous time
-    held: Array | None = None
+    held: Num[Array, "links"] | None = None
 
 
 def motor_force(

@@ -12,19 +12,19 @@ from typing import NamedTuple
 
 from jaxmodel.kinematics import Bend, Chain, close_chain
 from jaxmodel.lazy import jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.plant import Plant
 
 
 class Accelerations(NamedTuple):
     """Result of one evaluation of the dynamics."""
 
-    pose: Array  # X'' [m/s2, m/s2, rad/s2], (3,)
-    modal: Array  # q'' [m/s2], (3, R)
-    coupling: Array  # q'' + (k q + d q')/m: all except the oscillator itself [m/s2], (3, R)
-    rho: Array  # rho'' [m/s2], (3,)
-    beta: Array  # beta'' of the links in the plane [rad/s2], (3,)
-    axial: Array  # N, tension in the link that acts on its bending [N], (3,)
+    pose: Num[Array, "pose"]  # X'' [m/s2, m/s2, rad/s2]
+    modal: Num[Array, "links R"]  # q'' [m/s2]
+    coupling: Num[Array, "links R"]  # q'' + (k q + d q')/m: all except the oscillator itself [m/s2]
+    rho: Num[Array, "links"]  # rho'' [m/s2]
+    beta: Num[Array, "links"]  # beta'' of the links in the plane [rad/s2]
+    axial: Num[Array, "links"]  # N, tension in the link that acts on its bending [N]
 
 
 def shortening_row(plant: Plant, q: Array) -> Array:
@@ -195,12 +195,12 @@ def _is_rigid(plant: Plant) -> bool:
 
 
 class _Swing(NamedTuple):
-    """Contribution of gamma' and bending to C'' [m/s2], (3,) each."""
+    """Contribution of gamma' and bending to C'' [m/s2]."""
 
-    f: Array  # along f and g, sign reversed: what rho'' and gamma'' must give
-    g: Array
-    inward: Array  # gamma'^2 c + e2, along the chord
-    across: Array  # 2 gamma' d', of a point moving inwards along the chord
+    f: Num[Array, "links"]  # along f and g, sign reversed: what rho'' and gamma'' must give
+    g: Num[Array, "links"]
+    inward: Num[Array, "links"]  # gamma'^2 c + e2, along the chord
+    across: Num[Array, "links"]  # 2 gamma' d', of a point moving inwards along the chord
 
 
 def _swing(plant: Plant, chain: Chain, q_rate: Array) -> _Swing:
@@ -257,10 +257,10 @@ def _link(
 
 
 class _Spread(NamedTuple):
-    """What distributed axial inertia adds to the lumped one, per modal coordinate, (3, R) each."""
+    """What distributed axial inertia adds to the lumped one, per modal coordinate."""
 
-    inward: Array  # p = (P - mu S) q, momentum along the chord [kg]
-    turning: Array  # Q q, taken from the moment of inertia [kg m]
+    inward: Num[Array, "links R"]  # p = (P - mu S) q, momentum along the chord [kg]
+    turning: Num[Array, "links R"]  # Q q, taken from the moment of inertia [kg m]
 
 
 def _spread(plant: Plant, q: Array) -> _Spread | None:
@@ -322,7 +322,7 @@ def _joint(chain: Chain, link: _Link) -> _Joint:
 class _End(NamedTuple):
     """Interaction of the modes with the far joint of a link."""
 
-    row: Array  # motion of C along f per modal coordinate, sign reversed [1], (3, R)
+    row: Num[Array, "links R"]  # motion of C along f per modal coordinate, sign reversed [1]
     # C'' along f that slider and link feel: -motion[0] + motion[1] C''_f + motion[2] C''_g
     motion: tuple[Array, Array, Array]
     # reaction on row_j of every mode [N]: force[0] + force[1] C''_f + force[2] C''_g
@@ -369,8 +369,8 @@ def _release_end(
 class Platform(NamedTuple):
     """Inertia of platform and payload: M_p X'' - phi'^2 moment = forces on the platform."""
 
-    # M_p, upper triangle [kg, kg m, kg m2], () each; None: zero; of a point without phi
-    matrix: tuple[Array | None, ...]
+    # M_p, upper triangle [kg, kg m, kg m2]; None: zero; of a point without phi
+    matrix: tuple[Num[Array, ""] | None, ...]
     moment: tuple[Array, Array] | None  # mass times its centre from X [kg m]; None: centre at X
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxmodel.case import Electronics
 from jaxmodel.lazy import jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 
 #: Sample period over lag above which the linearised loop treats an amplifier as infinitely fast.
 FASTEST = 1e3
@@ -23,8 +23,8 @@ _SERIES = 20  # terms for arguments up to 1
 class Amplifier(NamedTuple):
     """Remainder of a change of command during one plant step, 1 at its start [1]."""
 
-    course: Array  # at start, middle and end of a parabola with the same effect, (3,)
-    left: Array  # at the end, exp(-h/lag), ()
+    course: Num[Array, "3"]  # at start, middle and end of a parabola with the same effect
+    left: Num[Array, ""]  # at the end, exp(-h/lag)
 
 
 def measurement_chain(omega: Array, electronics: Electronics) -> Array:

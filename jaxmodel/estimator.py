@@ -18,19 +18,22 @@ from typing import NamedTuple
 from jaxmodel.case import Electronics
 from jaxmodel.electronics import measurement_chain
 from jaxmodel.lazy import jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 
 KINDS = ("modal_phase", "difference")
 
 
 class Estimator(NamedTuple):
-    """Coefficients per channel, (3, C) each; z^-1 polynomials, leading denominator term 1."""
+    """Coefficients per channel; z^-1 polynomials, leading denominator term 1."""
 
-    first: tuple[Array, Array, Array]  # numerator b0, b1 and denominator a1
-    denominator: tuple[Array, Array]  # a1, a2 of the second section
-    velocity: tuple[Array, Array, Array]  # its numerator for the velocity
-    position: tuple[Array, Array, Array]  # and for the position
-    direct: Array  # share of the raw channel signal in the position
+    # numerator b0, b1 and denominator a1
+    first: tuple[Num[Array, "links C"], Num[Array, "links C"], Num[Array, "links C"]]
+    denominator: tuple[Num[Array, "links C"], Num[Array, "links C"]]  # a1, a2 of the second section
+    # its numerator for the velocity
+    velocity: tuple[Num[Array, "links C"], Num[Array, "links C"], Num[Array, "links C"]]
+    # and for the position
+    position: tuple[Num[Array, "links C"], Num[Array, "links C"], Num[Array, "links C"]]
+    direct: Num[Array, "links C"]  # share of the raw channel signal in the position
 
 
 def design_estimator(
@@ -81,10 +84,11 @@ def second_order(corner: Array, zeta: Array, period: Array) -> tuple[Array, Arra
 
 
 class FilterState(NamedTuple):
-    """What the filters remember from sample to sample, (3, C) each."""
+    """What the filters remember from sample to sample."""
 
-    first: Array  # of the first-order section
-    second: tuple[Array, Array]  # delay line of the second-order section
+    first: Num[Array, "links C"]  # of the first-order section
+    # delay line of the second-order section
+    second: tuple[Num[Array, "links C"], Num[Array, "links C"]]
 
 
 def advance_filters(

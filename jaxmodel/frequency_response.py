@@ -31,7 +31,7 @@ from jaxmodel.kinematics import Bend, Chain, close_chain
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import Loop
 from jaxmodel.notch import notch_response
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Complex, Num
 from jaxmodel.plant import Plant
 
 #: Images on either side that are evaluated, and those of them from which the rest is extrapolated.
@@ -49,33 +49,34 @@ class PlantResponse(NamedTuple):
     motions: that of its chord's angle, and that of its near joint across it.
     """
 
-    mass: Array  # of the pose with straight links, (3, 3)
-    damping: Array  # of the drive in the pose, (3, 3)
-    stiffness: Array  # (3, 3)
+    mass: Num[Array, "pose pose"]  # of the pose with straight links
+    damping: Num[Array, "pose pose"]  # of the drive in the pose
+    stiffness: Num[Array, "pose pose"]
     # mass [kg], damping [N s/m] and stiffness [N/m] between a link's elongation and (pose,
-    # elongation), (3, 4) each; None: links keep their length, and ports are those of the pose
-    longer: tuple[Array, Array, Array] | None
-    square: Array  # omega^2 of the modes of a link with held ends [1/s2], (3, R)
-    decay: Array  # 2 zeta omega [1/s], (3, R)
-    port: Array  # these two per motion of each port [rad/m and 1], (3, 2, P)
-    enter: Array  # generalised force on the two per modal acceleration, (3, 2, R)
-    leave: Array  # inertia force on a mode per acceleration of the two, (3, 2, R)
-    push: Array  # force on an elongation per actuator volt [N/V], (3, K); None likewise
-    read: Array  # sensor volts per elongation [V/m], (3, K); None likewise
-    sensor: Array  # sensor volts per modal coordinate, (3, K, R)
-    actuator: Array  # modal force per actuator volt, (3, R, K)
-    direct: Array  # sensor volts per actuator volt by modes that are left out, (3, K, K)
-    deflection: Array  # from the chord at the stations per modal coordinate, (3, S, R)
-    direct_deflection: Array  # the same per actuator volt by modes that are left out, (3, S, K)
-    slide: Array  # of the actuated joints per motion of the pose, (3, P)
-    # of motors that follow late: position and rate gains of their drives [N/m] and [N s/m], (3,)
-    # each, which damping and stiffness have as if they did not, and lag [s], (); None: they do not
-    servo: tuple[Array, Array, Array] | None
-    period: Array  # T [s], ()
-    antialias: Array  # [rad/s], ()
-    highpass: Array | None  # of the patches [rad/s], None if there is none, ()
-    lag: Array | None  # of the amplifiers [s], None if there are none, ()
-    delay: Array | None  # from sample to command [samples], None: one, ()
+    # elongation); None: links keep their length, and ports are those of the pose
+    longer: tuple[Num[Array, "links pose+1"], ...] | None
+    square: Num[Array, "links R"]  # omega^2 of the modes of a link with held ends [1/s2]
+    decay: Num[Array, "links R"]  # 2 zeta omega [1/s]
+    port: Num[Array, "links 2 P"]  # these two per motion of each port [rad/m and 1]
+    enter: Num[Array, "links 2 R"]  # generalised force on the two per modal acceleration
+    leave: Num[Array, "links 2 R"]  # inertia force on a mode per acceleration of the two
+    push: Num[Array, "links K"]  # force on an elongation per actuator volt [N/V]; None likewise
+    read: Num[Array, "links K"]  # sensor volts per elongation [V/m]; None likewise
+    sensor: Num[Array, "links K R"]  # sensor volts per modal coordinate
+    actuator: Num[Array, "links R K"]  # modal force per actuator volt
+    direct: Num[Array, "links K K"]  # sensor volts per actuator volt by modes that are left out
+    deflection: Num[Array, "links S R"]  # from the chord at the stations per modal coordinate
+    # the same per actuator volt by modes that are left out
+    direct_deflection: Num[Array, "links S K"]
+    slide: Num[Array, "links P"]  # of the actuated joints per motion of the pose
+    # of motors that follow late: position and rate gains of their drives [N/m] and [N s/m],
+    # which damping and stiffness have as if they did not, and lag [s]; None: they do not
+    servo: tuple[Num[Array, "links"], Num[Array, "links"], Num[Array, ""]] | None
+    period: Num[Array, ""]  # T [s]
+    antialias: Num[Array, ""]  # [rad/s]
+    highpass: Num[Array, ""] | None  # of the patches [rad/s], None if there is none
+    lag: Num[Array, ""] | None  # of the amplifiers [s], None if there are none
+    delay: Num[Array, ""] | None  # from sample to command [samples], None: one
 
     @property
     def late(self) -> Array:
@@ -274,11 +275,11 @@ def late_stiffness(plant: Any, s: Array) -> Array:
 class Assembled(NamedTuple):
     """The rigid part of a machine: p coordinates, the pose and then the links' elongations."""
 
-    mass: Array  # (p, p)
-    damping: Array  # (p, p)
-    stiffness: Array  # (p, p)
-    enter: Array  # generalised force on them per modal acceleration, (3, p, R)
-    leave: Array  # inertia force on a mode per acceleration of them, (3, p, R)
+    mass: Num[Array, "p p"]
+    damping: Num[Array, "p p"]
+    stiffness: Num[Array, "p p"]
+    enter: Num[Array, "links p R"]  # generalised force on them per modal acceleration
+    leave: Num[Array, "links p R"]  # inertia force on a mode per acceleration of them
 
 
 def assembled(plant: Any, xp: Any = jnp) -> Assembled:
@@ -344,12 +345,14 @@ def image_weights(delay: Array) -> Array:
 
 
 class Images(NamedTuple):
-    """Responses at s_n before they are summed, complex, (I, outputs, inputs) each."""
+    """Responses at s_n before they are summed."""
 
-    sensed: Array  # sensor volts per held command [V/V], (I, 3 K, 3 K)
-    disturbed: Array  # sensor volts per held force on an actuated joint [V/N], (I, 3 K, 3)
-    bent: Array  # chord deflections by the plant's modes per held command [m/V], (I, 3 S, 3 K)
-    pushed: Array  # the same per held force on an actuated joint [m/N], (I, 3 S, 3)
+    sensed: Complex[Array, "I links*K links*K"]  # sensor volts per held command [V/V]
+    # sensor volts per held force on an actuated joint [V/N]
+    disturbed: Complex[Array, "I links*K links"]
+    # chord deflections by the plant's modes per held command [m/V]
+    bent: Complex[Array, "I links*S links*K"]
+    pushed: Complex[Array, "I links*S links"]  # the same per held force on an actuated joint [m/N]
 
 
 def plant_images(plant: PlantResponse, omega: Array, order: np.ndarray) -> Images:
@@ -535,13 +538,13 @@ def _turns(plant: PlantResponse, omega: Array, delay: Array, is_exact: bool) -> 
 
 
 class ClosedLoop(NamedTuple):
-    """Responses of the closed loop, complex."""
+    """Responses of the closed loop."""
 
-    sensitivity: Array  # S = (I + L)^-1 of the commands [1], (3 K, 3 K)
-    control_effort: Array  # commands per disturbance of the sensor voltages, S K [1], (3 K, 3 K)
-    disturbance_deflection: (
-        Array  # chord deflections per force on an actuated joint [m/N], (3 S, 3)
-    )
+    sensitivity: Complex[Array, "links*K links*K"]  # S = (I + L)^-1 of the commands [1]
+    # commands per disturbance of the sensor voltages, S K [1]
+    control_effort: Complex[Array, "links*K links*K"]
+    # chord deflections per force on an actuated joint [m/N]
+    disturbance_deflection: Complex[Array, "links*S links"]
 
 
 def close_loop(response: SampledLoopResponse, omega: Array, is_exact: bool = True) -> ClosedLoop:

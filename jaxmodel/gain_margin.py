@@ -26,7 +26,7 @@ from jaxmodel.loci import (
 )
 from jaxmodel.loop_figures import HIGHEST, LOWEST
 from jaxmodel.pairs import Pair
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num, Shaped
 from jaxmodel.return_difference import (
     NARROWEST,
     AssembledModes,
@@ -77,10 +77,10 @@ VISITS = 24
 class GainMargins(NamedTuple):
     """Of n loops."""
 
-    margin: Array  # [1], (n,)
-    omega: Array  # of what goes unstable there [rad/s], NaN: nothing, (n,)
-    is_static: Array  # whether that is the static stiffness, (n,)
-    is_known: Array  # whether the search saw all it had to, (n,)
+    margin: Num[Array, "n"]  # [1]
+    omega: Num[Array, "n"]  # of what goes unstable there [rad/s], NaN: nothing
+    is_static: Shaped[Array, "n"]  # whether that is the static stiffness
+    is_known: Shaped[Array, "n"]  # whether the search saw all it had to
 
 
 def gain_margins(

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.lazy import jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 
 #: r_n over the voltage limit [1].
 PLAYS = (0.125, 0.375, 0.625, 0.875)
@@ -26,8 +26,8 @@ WIDEST = 0.3
 class Hysteresis(NamedTuple):
     """Play operators, the same for every actuator."""
 
-    play: Array  # r_n [V], (N,)
-    weight: Array  # w [1], ()
+    play: Num[Array, "N"]  # r_n [V]
+    weight: Num[Array, ""]  # w [1]
 
 
 def design_hysteresis(width: Array, limit: Array) -> Hysteresis:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.lazy import jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 
 _DOUBLINGS = 8  # |omega h| up to 20 becomes below 0.1, where the series below is exact
 _TERMS = 10
@@ -26,10 +26,10 @@ _TERMS = 10
 class Exponential(NamedTuple):
     """Coefficients of one step of length h; n rows and columns (q, q', z, z'; s if drained)."""
 
-    half: Array  # exp(A h/2), upper left block, (2, 2, 3, R)
-    half_force: Array  # h/2 phi_1(A h/2) times the force direction, (2, 3, R)
-    full: Array  # exp(A h), (n, n, 3, R)
-    full_force: Array  # ETDRK4 weights of N(u), N(a) + N(b), N(c), (3, n, 3, R)
+    half: Num[Array, "2 2 links R"]  # exp(A h/2), upper left block
+    half_force: Num[Array, "2 links R"]  # h/2 phi_1(A h/2) times the force direction
+    full: Num[Array, "n n links R"]  # exp(A h)
+    full_force: Num[Array, "3 n links R"]  # ETDRK4 weights of N(u), N(a) + N(b), N(c)
 
 
 def exponential_step(

@@ -19,7 +19,7 @@ from jaxmodel.gain_margin import fold_frequency, gain_margins
 from jaxmodel.laws import LAWS
 from jaxmodel.lazy import compiled, jax, jnp
 from jaxmodel.loop_figures import MARGIN_MODES
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num, Shaped
 from jaxmodel.prepare import prepare
 from jaxmodel.return_difference import (
     AssembledModes,
@@ -41,12 +41,13 @@ LEAST_DAMPED, UNEVEN = 5e-4, 20.0
 class LoopVerdicts(NamedTuple):
     """Figures of n sampled loops about rest at the first way-point."""
 
-    gain_margin: Array  # largest common factor on all gains, all smaller ones stable [1], (n,)
-    breaking_frequency: Array  # of what goes unstable at the margin [Hz], NaN: nothing, (n,)
-    breaking_mode: Array  # order of the link mode nearest to it, 0: the platform's; NaN: none, (n,)
-    # least [1] of the most damped modes of each order, one per controlled link, (n, J)
-    least_damping: Array
-    is_known: Array  # 0 where the search cannot tell, (n,)
+    gain_margin: Num[Array, "n"]  # largest common factor on all gains, all smaller ones stable [1]
+    breaking_frequency: Num[Array, "n"]  # of what goes unstable at the margin [Hz], NaN: nothing
+    # order of the link mode nearest to it, 0: the platform's; NaN: none
+    breaking_mode: Num[Array, "n"]
+    # least [1] of the most damped modes of each order, one per controlled link
+    least_damping: Num[Array, "n J"]
+    is_known: Shaped[Array, "n"]  # 0 where the search cannot tell
 
 
 def with_margin_modes(

@@ -17,7 +17,7 @@ import numpy as np
 from jaxmodel import status
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.mechanisms.contract import SINGULAR_MARGIN, Near
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.plant import Plant
 from jaxmodel.trigonometry import sine_cosine
 
@@ -26,30 +26,30 @@ TINY_AREA = 1e-20
 
 
 class Bend(NamedTuple):
-    """Effect of bending on a link's far joint, (3,) each; None: none."""
+    """Effect of bending on a link's far joint; None: none."""
 
-    tip: Array | None = None  # w, deflection of C from the link's tangent frame [m]
-    tip_rate: Array | None = None  # [m/s]
-    shortening: Array | None = None  # d, link length minus chord length [m]
-    shortening_rate: Array | None = None  # [m/s]
+    tip: Num[Array, "links"] | None = None  # w, deflection of C from the link's tangent frame [m]
+    tip_rate: Num[Array, "links"] | None = None  # [m/s]
+    shortening: Num[Array, "links"] | None = None  # d, link length minus chord length [m]
+    shortening_rate: Num[Array, "links"] | None = None  # [m/s]
 
 
 class Frame(NamedTuple):
-    """Axes f and g (f turned by +90 deg) at the joints C, (3,) each.
+    """Axes f and g (f turned by +90 deg) at the joints C.
 
     f points where bending moves C within its link: along t as the chord shortens, or along -n_t
     where Y_j(L) is not zero. When C of a rigid link moves by (f, g), rho moves by
     rho_f f + rho_g g and gamma by beta_f f + beta_g g.
     """
 
-    x: Array  # direction of f in the plane [1]
-    y: Array
-    c_f: Array | None  # C - X along f [m]; None: the platform is a point
-    c_g: Array | None
-    rho_f: Array  # [1]
-    rho_g: Array | None  # None: zero
-    beta_f: Array  # [1/m]
-    beta_g: Array
+    x: Num[Array, "links"]  # direction of f in the plane [1]
+    y: Num[Array, "links"]
+    c_f: Num[Array, "links"] | None  # C - X along f [m]; None: the platform is a point
+    c_g: Num[Array, "links"] | None
+    rho_f: Num[Array, "links"]  # [1]
+    rho_g: Num[Array, "links"] | None  # None: zero
+    beta_f: Num[Array, "links"]  # [1/m]
+    beta_g: Num[Array, "links"]
 
     def link_motion(self, along_f: Array, along_g: Array) -> tuple[Array, Array]:
         """Rates of rho and gamma from those of C."""
@@ -76,22 +76,24 @@ class Frame(NamedTuple):
 
 
 class Chain(NamedTuple):
-    """Positions and rates of the chain at one instant, per link, (3,) each."""
+    """Positions and rates of the chain at one instant, per link."""
 
     bend: Bend
     frame: Frame
-    turn: tuple[Array, Array] | None  # sin and cos of phi [1], () each; None: it is a point
-    cx: Array | None  # C - X in the plane [m]
-    cy: Array | None
+    # sin and cos of phi [1]; None: it is a point
+    turn: tuple[Num[Array, ""], Num[Array, ""]] | None
+    cx: Num[Array, "links"] | None  # C - X in the plane [m]
+    cy: Num[Array, "links"] | None
     near: Near  # joints B
-    far: tuple[Array, Array]  # joints C in the plane [m]
-    chord: Array  # c [m]
-    sine: Array  # sin gamma [1]
-    cosine: Array  # cos gamma [1]
-    rho: Array  # position of the actuated joint [m]
-    rho_rate: Array  # [m/s]
-    beta_rate: Array  # of the link in the plane [rad/s]
-    turning: Array | None  # rho'^2/r, acceleration of B towards n [m/s2]; None: straight paths
+    far: tuple[Num[Array, "links"], Num[Array, "links"]]  # joints C in the plane [m]
+    chord: Num[Array, "links"]  # c [m]
+    sine: Num[Array, "links"]  # sin gamma [1]
+    cosine: Num[Array, "links"]  # cos gamma [1]
+    rho: Num[Array, "links"]  # position of the actuated joint [m]
+    rho_rate: Num[Array, "links"]  # [m/s]
+    beta_rate: Num[Array, "links"]  # of the link in the plane [rad/s]
+    # rho'^2/r, acceleration of B towards n [m/s2]; None: straight paths
+    turning: Num[Array, "links"] | None
 
 
 def close_chain(plant: Plant, pose: Array, pose_rate: Array, bend: Bend | None = None) -> Chain:

@@ -21,7 +21,7 @@ from jaxmodel.dynamics import inverse_dynamics, kinetic_energy, modal_chain
 from jaxmodel.kinematics import close_chain
 from jaxmodel.lazy import compiled, jax, jnp
 from jaxmodel.loop import Loop, PlantState, plant_rates
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 
 
 class LinearPlant(NamedTuple):
@@ -30,17 +30,18 @@ class LinearPlant(NamedTuple):
     States of motors that follow late come last in x.
     """
 
-    state: Array  # A [1/s and mixed], (n, n), n = 6 + 6 (coordinates of a link)
-    voltage: Array  # B_voltage, (n, 3 K)
-    force: Array  # B_force, disturbance on the actuated joints, (n, 3)
-    deflection: Array  # chord deflection at the stations [m], (3 S, n)
-    sensor: Array  # voltages of the sensors, open-circuit [V], (3 K, n)
+    state: Num[Array, "n n"]  # A [1/s and mixed], n = 6 + 6 (coordinates of a link)
+    voltage: Num[Array, "n links*K"]  # B_voltage
+    force: Num[Array, "n links"]  # B_force, disturbance on the actuated joints
+    deflection: Num[Array, "links*S n"]  # chord deflection at the stations [m]
+    sensor: Num[Array, "links*K n"]  # voltages of the sensors, open-circuit [V]
     # what the actuators' voltages add at once to both, by the modes that are left out
-    direct_deflection: Array  # [m/V], (3 S, 3 K)
-    direct_sensor: Array  # [V/V], (3 K, 3 K)
-    # what a sampled drive reads: positions of the joints [m], then their speeds [m/s], (2 l, n)
-    slider: Array | None = None
-    motor: Array | None = None  # B of commands to motors that follow late, (n, 3); None: as force
+    direct_deflection: Num[Array, "links*S links*K"]  # [m/V]
+    direct_sensor: Num[Array, "links*K links*K"]  # [V/V]
+    # what a sampled drive reads: positions of the joints [m], then their speeds [m/s]
+    slider: Num[Array, "2*links n"] | None = None
+    # B of commands to motors that follow late; None: as force
+    motor: Num[Array, "n links"] | None = None
 
 
 def flatten(state: PlantState) -> Array:
@@ -59,11 +60,11 @@ def unflatten(x: Array, structure: Structure) -> PlantState:
 
 
 class Moment(NamedTuple):
-    """An instant of a motion under load, (3,) each."""
+    """An instant of a motion under load."""
 
-    rate: Array  # X' [m/s, m/s, rad/s]
-    acceleration: Array  # X'' [m/s2, m/s2, rad/s2]
-    wrench: Array  # on the platform [N, N, N m]
+    rate: Num[Array, "pose"]  # X' [m/s, m/s, rad/s]
+    acceleration: Num[Array, "pose"]  # X'' [m/s2, m/s2, rad/s2]
+    wrench: Num[Array, "pose"]  # on the platform [N, N, N m]
 
 
 def resting(structure: Structure, case: Case) -> Moment | None:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.pairs import Pair
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.return_difference import (
     LoopGain,
     LoopResponse,
@@ -34,21 +34,21 @@ class Loci(NamedTuple):
     """State of the sweep: n eigenvalues, one for each channel."""
 
     value: Pair  # [1], (n,)
-    omega: Array  # where they have it [rad/s], (); 0: nowhere yet
-    # rightmost crossing of each curve by linear interpolation [1], and where [rad/s]; 0: none, (n,)
-    crossing: Array
-    place: Array
-    # largest value close to the axis, crossing or not [1], and where [rad/s]; 0: none, (n,)
-    close: Array
-    close_at: Array
+    omega: Num[Array, ""]  # where they have it [rad/s]; 0: nowhere yet
+    # rightmost crossing of each curve by linear interpolation [1], and where [rad/s]; 0: none
+    crossing: Num[Array, "n"]
+    place: Num[Array, "n"]
+    # largest value close to the axis, crossing or not [1], and where [rad/s]; 0: none
+    close: Num[Array, "n"]
+    close_at: Num[Array, "n"]
 
 
 class FrequencyPoint(NamedTuple):
     """A frequency of the sweep."""
 
-    omega: Array  # [rad/s], rising, never 0, ()
-    cosine: Array  # of omega T, ()
-    sine: Array
+    omega: Num[Array, ""]  # [rad/s], rising, never 0
+    cosine: Num[Array, ""]  # of omega T
+    sine: Num[Array, ""]
 
 
 def start_loci(value: Pair) -> Loci:
@@ -120,11 +120,11 @@ def _improve_values(loop_gain: LoopGain, values: Pair) -> Pair:
 class AxisCrossing(NamedTuple):
     """An estimate of where an eigenvalue is real and positive, to be refined."""
 
-    omega: Array  # [rad/s], ()
-    value: Array  # the eigenvalue, 1/k [1], ()
-    cosine: Array  # of omega T, ()
-    sine: Array
-    step: Array  # the last one as a share of the largest allowed, ()
+    omega: Num[Array, ""]  # [rad/s]
+    value: Num[Array, ""]  # the eigenvalue, 1/k [1]
+    cosine: Num[Array, ""]  # of omega T
+    sine: Num[Array, ""]
+    step: Num[Array, ""]  # the last one as a share of the largest allowed
     by_omega: Pair  # derivatives of det(x - L) by frequency and eigenvalue, ()
     by_value: Pair
 
@@ -132,8 +132,8 @@ class AxisCrossing(NamedTuple):
 class Crossing(NamedTuple):
     """Where an eigenvalue is real and positive."""
 
-    value: Array  # the eigenvalue [1], 0: nowhere, ()
-    omega: Array  # [rad/s], ()
+    value: Num[Array, ""]  # the eigenvalue [1], 0: nowhere
+    omega: Num[Array, ""]  # [rad/s]
     by_omega: Pair  # slopes of det(x - L) there
     by_value: Pair
 

@@ -24,7 +24,7 @@ from jaxmodel.integrator import Exponential
 from jaxmodel.joints import rub
 from jaxmodel.kinematics import Chain, chain_status, close_chain
 from jaxmodel.lazy import jax, jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.plant import Plant
 
 #: Chord deflection beyond this fraction of the link counts as diverged [1].
@@ -37,28 +37,31 @@ class Loop(NamedTuple):
     """Everything `step` reads that stays constant over a run."""
 
     plant: Plant
-    omega: Array  # plant modes [rad/s], (3, R)
+    omega: Num[Array, "links R"]  # plant modes [rad/s]
     exponential: Exponential
-    plant_step: Array  # length of one plant step [s], ()
+    plant_step: Num[Array, ""]  # length of one plant step [s]
     amplifier: Amplifier | None  # None: commands are on the actuators at once
-    sensor: Array  # V_s of a modal coordinate, lambda_s Phi_s^t [V/m], (3, K, R)
-    actuator: Array  # modal acceleration of a voltage, lambda_a Phi_a/m [m/s2/V], (3, R, K)
-    deflection_at: Array  # chord deflection at the stations [1], (3, S, R)
+    sensor: Num[Array, "links K R"]  # V_s of a modal coordinate, lambda_s Phi_s^t [V/m]
+    actuator: Num[Array, "links R K"]  # modal acceleration of a voltage, lambda_a Phi_a/m [m/s2/V]
+    deflection_at: Num[Array, "links S R"]  # chord deflection at the stations [1]
     controller: Controller
-    ideal: tuple[Array, Array | None] | None  # voltage of q' [V s/m] and q [V/m], (3, K, R) each
-    observer: Array  # controlled modes of the true deflection, modal filter x sensor [1], (3, C, R)
-    modal_omega: Array  # frequencies of the controller's modes [rad/s], (3, C)
-    rotation: tuple[Array, Array]  # of the spectra's phasors per sample, (3, C, n_frequencies)
+    # voltage of q' [V s/m] and q [V/m]
+    ideal: tuple[Num[Array, "links K R"], Num[Array, "links K R"] | None] | None
+    # controlled modes of the true deflection, modal filter x sensor [1]
+    observer: Num[Array, "links C R"]
+    modal_omega: Num[Array, "links C"]  # frequencies of the controller's modes [rad/s]
+    # of the spectra's phasors per sample
+    rotation: tuple[Num[Array, "links C n_frequencies"], Num[Array, "links C n_frequencies"]]
     drive: Drive
-    axial_compliance: Array  # L/(E A) of the links [m/N], (3,)
+    axial_compliance: Num[Array, "links"]  # L/(E A) of the links [m/N]
     left_out: LeftOut | None  # static response of the modes left out; None: truncated model
-    settling_band: Array  # [m], ()
+    settling_band: Num[Array, ""]  # [m]
     delayed: Delayed | None = None  # None: commands are held from sample to sample, one later
     hysteresis: Hysteresis | None = None  # of the actuators; None: they are linear
     rest: Rest | None = None  # about which the linear model is taken; None: the full model
     # omega^2 [1/s2] and decay [1/s] of the elongations' oscillators in `exponential`, less those of
-    # links alone, (3,) each; None: links keep their length
-    split: tuple[Array, Array] | None = None
+    # links alone; None: links keep their length
+    split: tuple[Num[Array, "links"], Num[Array, "links"]] | None = None
     strain: tuple[Array, Array] | None = None  # `Sample.strain` of q [1/m] and of voltages [1/V]
 
 
@@ -74,27 +77,27 @@ def coordinate_omega(loop: Loop) -> Array:
 class Delayed(NamedTuple):
     """Commands that change within samples; the loop's own plant steps are those after it."""
 
-    before: Array  # 1 for the command u_(k-j) until the change, else 0, (J,)
-    after: Array  # the same from the change on, (J,)
+    before: Num[Array, "J"]  # 1 for the command u_(k-j) until the change, else 0
+    after: Num[Array, "J"]  # the same from the change on
     # plant steps until the change
     exponential: Exponential
-    plant_step: Array  # [s], ()
+    plant_step: Num[Array, ""]  # [s]
     amplifier: Amplifier | None
-    passage: Array | None
+    passage: Num[Array, "5 5"] | None
 
 
 class LeftOut(NamedTuple):
     """What actuators do at once, by the modes that the plant leaves out (`jaxmodel.static`)."""
 
-    sensor: Array  # D, sensor voltages [V/V], (3, K, K)
-    deflection: Array  # from the chord at the stations [m/V], (3, S, K)
-    passage: Array | None  # of `electronics.voltage_passage`, (5, 5); None: nothing is sampled
+    sensor: Num[Array, "links K K"]  # D, sensor voltages [V/V]
+    deflection: Num[Array, "links S K"]  # from the chord at the stations [m/V]
+    passage: Num[Array, "5 5"] | None  # of `electronics.voltage_passage`; None: nothing is sampled
 
 
 class Rest(NamedTuple):
     """The machine at rest."""
 
-    pose: Array  # [m, m, rad], (3,)
+    pose: Num[Array, "pose"]  # [m, m, rad]
     reference: Reference  # what holds it there
 
 
@@ -105,21 +108,22 @@ class PlantState(NamedTuple):
     are the actuators' voltages, to which sensors answer by the modes that are left out.
     """
 
-    pose: Array  # [m, m, rad], (3,)
-    pose_rate: Array  # (3,)
-    q: Array  # [m], (3, R)
-    q_rate: Array  # [m/s], (3, R)
-    z: Array | None = None  # anti-alias filtered q - s [m], (3, R)
-    z_rate: Array | None = None  # [m/s], (3, R)
-    s: Array | None = None  # slow part of q, which the amplifiers' inputs drain [m], (3, R)
-    voltage: Array | None = None  # on the actuators, behind their amplifiers [V], (3, K)
+    pose: Num[Array, "pose"]  # [m, m, rad]
+    pose_rate: Num[Array, "pose"]
+    q: Num[Array, "links R"]  # [m]
+    q_rate: Num[Array, "links R"]  # [m/s]
+    z: Num[Array, "links R"] | None = None  # anti-alias filtered q - s [m]
+    z_rate: Num[Array, "links R"] | None = None  # [m/s]
+    s: Num[Array, "links R"] | None = None  # slow part of q, which the amplifiers' inputs drain [m]
+    voltage: Num[Array, "links K"] | None = None  # on the actuators, behind their amplifiers [V]
     # the actuators' voltages as modes that are left out show them to the sensors
-    direct_z: Array | None = None  # anti-alias filtered [V], (3, K)
-    direct_z_rate: Array | None = None  # [V/s], (3, K)
-    direct_s: Array | None = None  # drained by the amplifiers' inputs [V], (3, K)
-    commands: Array | None = None  # on their way, u_(k-2), u_(k-3), .. [V], (J - 2, 3, K)
-    plays: Array | None = None  # of the actuators' hysteresis [V], (N, 3, K)
-    motor: Array | None = None  # of motors that follow late, see `drive.LAG` [N], (3, n)
+    direct_z: Num[Array, "links K"] | None = None  # anti-alias filtered [V]
+    direct_z_rate: Num[Array, "links K"] | None = None  # [V/s]
+    direct_s: Num[Array, "links K"] | None = None  # drained by the amplifiers' inputs [V]
+    # on their way, u_(k-2), u_(k-3), .. [V]
+    commands: Num[Array, "waiting links K"] | None = None
+    plays: Num[Array, "N links K"] | None = None  # of the actuators' hysteresis [V]
+    motor: Num[Array, "links n"] | None = None  # of motors that follow late, see `drive.LAG` [N]
 
 
 class State(NamedTuple):
@@ -128,37 +132,37 @@ class State(NamedTuple):
     plant: PlantState
     controller: ControllerState
     totals: metrics.Totals
-    status: Array  # code of `jaxmodel.status`, as a float, ()
-    bad_time: Array  # when the status appeared [s], 0 while OK, ()
+    status: Num[Array, ""]  # code of `jaxmodel.status`, as a float
+    bad_time: Num[Array, ""]  # when the status appeared [s], 0 while OK
     drive: DriveState | None = None  # None: the drive is not sampled
 
 
 class Inputs(NamedTuple):
     """External inputs of one sample, at P = 2 substeps + 1 points from start to end."""
 
-    rho: Array  # desired actuated coordinate [m], (P, 3)
-    rho_rate: Array  # [m/s], (P, 3)
-    feedforward: Array | None  # [N], (P, 3)
-    pose: Array  # desired pose at the start [m, m, rad], (3,)
-    disturbance: Array  # drive force held over the sample [N], (3,)
-    wrench: Array | None  # on the platform, held over the sample [N, N, N m], (3,)
-    adc_noise: Array | None  # standard normal, (3, K)
+    rho: Num[Array, "P links"]  # desired actuated coordinate [m]
+    rho_rate: Num[Array, "P links"]  # [m/s]
+    feedforward: Num[Array, "P links"] | None  # [N]
+    pose: Num[Array, "pose"]  # desired pose at the start [m, m, rad]
+    disturbance: Num[Array, "links"]  # drive force held over the sample [N]
+    wrench: Num[Array, "pose"] | None  # on the platform, held over the sample [N, N, N m]
+    adc_noise: Num[Array, "links K"] | None  # standard normal
     window: metrics.Window
 
 
 class Record(NamedTuple):
     """Signals at the sampling instant, for trajectories."""
 
-    time: Array  # [s], ()
-    pose: Array  # (3,)
-    pose_error: Array  # against the shaped reference, (3,)
-    slider: Array  # rho [m], (3,)
-    modal_coordinate: Array  # plant q [m], (3, R)
-    controlled_coordinate: Array  # controller's modes, noise-free [m], (3, C)
-    chord_deflection_stations: Array  # [m], (3, S)
-    sensor_voltage: Array  # raw V_s [V], (3, K)
-    actuator_voltage: Array  # command of this sample [V], (3, K)
-    slider_force: Array  # of the motors [N], (3,)
+    time: Num[Array, ""]  # [s]
+    pose: Num[Array, "pose"]
+    pose_error: Num[Array, "pose"]  # against the shaped reference
+    slider: Num[Array, "links"]  # rho [m]
+    modal_coordinate: Num[Array, "links R"]  # plant q [m]
+    controlled_coordinate: Num[Array, "links C"]  # controller's modes, noise-free [m]
+    chord_deflection_stations: Num[Array, "links S"]  # [m]
+    sensor_voltage: Num[Array, "links K"]  # raw V_s [V]
+    actuator_voltage: Num[Array, "links K"]  # command of this sample [V]
+    slider_force: Num[Array, "links"]  # of the motors [N]
 
 
 class Rates(NamedTuple):
@@ -166,7 +170,7 @@ class Rates(NamedTuple):
 
     chain: Chain
     acceleration: Accelerations
-    motor: Array | None  # of `PlantState.motor` [N/s], (3, n)
+    motor: Num[Array, "links n"] | None  # of `PlantState.motor` [N/s]
 
 
 def plant_rates(

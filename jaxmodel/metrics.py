@@ -17,47 +17,48 @@ from typing import Any, NamedTuple
 
 from jaxmodel.control import efficient_modal_control
 from jaxmodel.lazy import jax, jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.table import PartError, Table, is_real
 
 
 class Sample(NamedTuple):
     """What the metrics read at one sampling instant."""
 
-    deflection: Array  # chord deflection at the stations [m], (3, S)
-    q: Array  # plant modes [m], (3, R)
-    q_rate: Array  # [m/s], (3, R)
-    modal: Array  # controlled modes as seen by an ideal modal filter [m], (3, C)
-    modal_rate: Array  # [m/s], (3, C)
-    pose_error: Array  # against the shaped reference [m, m, rad], (3,)
-    voltage: Array  # on the actuators [V], (3, K)
-    is_saturated: Array  # share of this sample with an actuator at its limit, 0 or 1, ()
-    is_clipped: Array  # 1 where any ADC channel clips, ()
-    motor_force: Array  # [N], (3,)
-    is_motor_saturated: Array  # share of this sample with a motor at its limit, 0 or 1, ()
-    axial_force: Array  # tension in the links [N], (3,)
-    stretch_error: Array  # of the platform if links stretched [m, m, rad], (3,)
-    # of the ceramics' outer faces [1], (3, K or 2 K); None: `patch_strain_peak` is not accumulated
-    strain: Array
+    deflection: Num[Array, "links S"]  # chord deflection at the stations [m]
+    q: Num[Array, "links R"]  # plant modes [m]
+    q_rate: Num[Array, "links R"]  # [m/s]
+    modal: Num[Array, "links C"]  # controlled modes as seen by an ideal modal filter [m]
+    modal_rate: Num[Array, "links C"]  # [m/s]
+    pose_error: Num[Array, "pose"]  # against the shaped reference [m, m, rad]
+    voltage: Num[Array, "links K"]  # on the actuators [V]
+    is_saturated: Num[Array, ""]  # share of this sample with an actuator at its limit, 0 or 1
+    is_clipped: Num[Array, ""]  # 1 where any ADC channel clips
+    motor_force: Num[Array, "links"]  # [N]
+    is_motor_saturated: Num[Array, ""]  # share of this sample with a motor at its limit, 0 or 1
+    axial_force: Num[Array, "links"]  # tension in the links [N]
+    stretch_error: Num[Array, "pose"]  # of the platform if links stretched [m, m, rad]
+    # of the ceramics' outer faces [1]; None: `patch_strain_peak` is not accumulated
+    strain: Num[Array, "links K"] | Num[Array, "links 2*K"]
 
 
 class Window(NamedTuple):
-    """Weights of this instant, () each."""
+    """Weights of this instant."""
 
-    time: Array  # t [s]
-    is_moving: Array  # 0 or 1
-    is_residual: Array  # 0 or 1
-    after_command: Array  # time since the end of the reference, 0 before [s]
-    taper: Array  # Hann window of the spectra [1]
+    time: Num[Array, ""]  # t [s]
+    is_moving: Num[Array, ""]  # 0 or 1
+    is_residual: Num[Array, ""]  # 0 or 1
+    after_command: Num[Array, ""]  # time since the end of the reference, 0 before [s]
+    taper: Num[Array, ""]  # Hann window of the spectra [1]
 
 
 class Fixed(NamedTuple):
     """What the metrics read from the case at every sample."""
 
-    omega: Array  # plant modes [rad/s], (3, R)
-    modal_omega: Array  # controller's modes [rad/s], (3, C)
-    rotation: tuple[Array, Array]  # cos and sin of (frequency x period), (3, C, n_frequencies)
-    band: Array  # settling band [m], ()
+    omega: Num[Array, "links R"]  # plant modes [rad/s]
+    modal_omega: Num[Array, "links C"]  # controller's modes [rad/s]
+    # cos and sin of (frequency x period)
+    rotation: tuple[Num[Array, "links C n_frequencies"], Num[Array, "links C n_frequencies"]]
+    band: Num[Array, ""]  # settling band [m]
 
 
 class Instant(NamedTuple):
@@ -71,8 +72,8 @@ class Instant(NamedTuple):
 class Ending(NamedTuple):
     """What the metrics read from the case at the end."""
 
-    period: Array  # between samples [s], ()
-    modal_omega: Array  # controller's modes [rad/s], (3, C)
+    period: Num[Array, ""]  # between samples [s]
+    modal_omega: Num[Array, "links C"]  # controller's modes [rad/s]
 
 
 #: Arrays by the name of their `Total`.

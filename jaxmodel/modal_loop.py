@@ -15,7 +15,7 @@ from jaxmodel.controller import Controller, linear_law
 from jaxmodel.discs import Disc
 from jaxmodel.frequency_response import assembled, plant_response
 from jaxmodel.lazy import jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.piezo import patch_ends
 from jaxmodel.prepare import prepare, stretch_of
 from jaxmodel.stretch import held_voltage
@@ -29,32 +29,35 @@ class ModalLoop(NamedTuple):
     has p coordinates: the pose, and the elongations of links that lengthen.
     """
 
-    mass: Array  # of the rigid part without payload, (p, p)
-    payload_mass: Array  # what each kilogram of payload adds to it [1/kg], (p, p)
-    payload: Array  # of the study [kg], ()
-    damping: Array  # of the drive, (p, p)
-    stiffness: Array  # (p, p)
-    axial_damping: Array  # of the links along themselves, in proportion to their stiffness, (p, p)
-    axial_stiffness: Array  # (p, p)
-    omega: Array  # of the modes without axial force [rad/s], (3, R)
-    spring: Array  # by axial forces, over omega^2 [1], (3, R)
-    zeta: Array  # damping ratios [1], (3, R)
-    exponent: Array  # p of zeta ~ omega^p beyond the R modes [1], ()
-    enter: Array  # force on the rigid part per modal acceleration, (3, p, R)
-    leave: Array  # inertia force on a mode per acceleration of the rigid part, (3, p, R)
-    push: Array  # force on the rigid part per actuator voltage, (p, U)
-    read: Array  # sensor voltages per rigid coordinate, (U, p)
-    sensor: Array  # sensor voltages per modal coordinate, (3, K, R)
-    actuator: Array  # on the modes per actuator voltage, (3, R, K)
-    # what |sensor| and |actuator| over the mode's number never exceed, (3, K) each
-    steepest: tuple[Array, Array]
-    held: Array  # sensor voltage per voltage of links that keep their length [V/V], (3, K, K)
-    exact: Array | None  # it and the static one of all modes [V/V], (3, K, K); None: no correction
+    mass: Num[Array, "p p"]  # of the rigid part without payload
+    payload_mass: Num[Array, "p p"]  # what each kilogram of payload adds to it [1/kg]
+    payload: Num[Array, ""]  # of the study [kg]
+    damping: Num[Array, "p p"]  # of the drive
+    stiffness: Num[Array, "p p"]
+    # of the links along themselves, in proportion to their stiffness
+    axial_damping: Num[Array, "p p"]
+    axial_stiffness: Num[Array, "p p"]
+    omega: Num[Array, "links R"]  # of the modes without axial force [rad/s]
+    spring: Num[Array, "links R"]  # by axial forces, over omega^2 [1]
+    zeta: Num[Array, "links R"]  # damping ratios [1]
+    exponent: Num[Array, ""]  # p of zeta ~ omega^p beyond the R modes [1]
+    enter: Num[Array, "links p R"]  # force on the rigid part per modal acceleration
+    leave: Num[Array, "links p R"]  # inertia force on a mode per acceleration of the rigid part
+    push: Num[Array, "p U"]  # force on the rigid part per actuator voltage
+    read: Num[Array, "U p"]  # sensor voltages per rigid coordinate
+    sensor: Num[Array, "links K R"]  # sensor voltages per modal coordinate
+    actuator: Num[Array, "links R K"]  # on the modes per actuator voltage
+    # what |sensor| and |actuator| over the mode's number never exceed
+    steepest: tuple[Num[Array, "links K"], Num[Array, "links K"]]
+    # sensor voltage per voltage of links that keep their length [V/V]
+    held: Num[Array, "links K K"]
+    # it and the static one of all modes [V/V]; None: no correction
+    exact: Num[Array, "links K K"] | None
     law: tuple[Array, Array, Array, Array]  # A, B, C, D
-    period: Array  # T [s], ()
-    antialias: Array  # [rad/s], ()
-    highpass: Array | None  # [rad/s], None if there is none, ()
-    lag: Array | None  # of the amplifiers [s], None if there are none, ()
+    period: Num[Array, ""]  # T [s]
+    antialias: Num[Array, ""]  # [rad/s]
+    highpass: Num[Array, ""] | None  # [rad/s], None if there is none
+    lag: Num[Array, ""] | None  # of the amplifiers [s], None if there are none
 
 
 def modal_loop(structure: Structure, case: Case, pose: Array, law: Controller) -> ModalLoop:

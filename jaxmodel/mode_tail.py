@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.modal_loop import ModalLoop
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 
 #: Bands of width 2 pi/T, one per image, that are bounded one by one.
 BANDS = 60
@@ -37,24 +37,24 @@ class Tail(NamedTuple):
     """
 
     # from command to sampled voltage, times E, chain included, by slices of omega, at image 0 what
-    # modes answer at once, (slices, U, U)
-    images: Array
-    # the rest at image 0, chain excluded: sensors from pose, (U, p), about half the static answer
+    # modes answer at once
+    images: Num[Array, "slices U U"]
+    # the rest at image 0, chain excluded: sensors from pose, about half the static answer
     # of known modes, so that any number of them is as near
-    sensor_by_pose: Array
-    pose_by_voltage: Array  # force on the pose from voltage, (p, U)
-    pose_by_pose: Array  # from pose, per nu^4, (p, p)
+    sensor_by_pose: Num[Array, "U p"]
+    pose_by_voltage: Num[Array, "p U"]  # force on the pose from voltage
+    pose_by_pose: Num[Array, "p p"]  # from pose, per nu^4
 
 
 class _Sizes(NamedTuple):
     """Moduli of couplings, links and modes first; pose in coordinates of unit mass, largest E."""
 
-    sense: Array  # sensors per modal coordinate, (3, R, K)
-    pull: Array  # static answer to voltages, |actuator|/omega^2, (3, R, K)
-    enter: Array  # (3, R)
-    leave: Array  # (3, R)
-    push: Array  # force on the pose by voltages at once, times E, (U,)
-    read: Array  # sensors by the pose at once, (U,)
+    sense: Num[Array, "links R K"]  # sensors per modal coordinate
+    pull: Num[Array, "links R K"]  # static answer to voltages, |actuator|/omega^2
+    enter: Num[Array, "links R"]
+    leave: Num[Array, "links R"]
+    push: Num[Array, "U"]  # force on the pose by voltages at once, times E
+    read: Num[Array, "U"]  # sensors by the pose at once
     spring: float  # pose stiffness over mass [1/s2]
 
 
@@ -62,8 +62,8 @@ class _Unknown(NamedTuple):
     """The same of modes j beyond those that are known one by one; closed forms of j."""
 
     known: int  # J, modes that are known
-    sense: Array  # per j, (3, K)
-    pull: Array  # times j^3, (3, K)
+    sense: Num[Array, "links K"]  # per j
+    pull: Num[Array, "links K"]  # times j^3
     enter: float  # times j
     leave: float  # times j
     omega: float  # over j^2, the smallest [rad/s]
@@ -164,11 +164,11 @@ def _first_image(
 
 
 class _Band(NamedTuple):
-    """Suprema over a band of omega and all stiffnesses, (3, R) each."""
+    """Suprema over a band of omega and all stiffnesses."""
 
-    answer: Array  # 1/|D|
-    inertial: Array  # x^2/|D|
-    remainder: Array  # |1/D - 1|
+    answer: Num[Array, "links R"]  # 1/|D|
+    inertial: Num[Array, "links R"]  # x^2/|D|
+    remainder: Num[Array, "links R"]  # |1/D - 1|
 
 
 def least_denominator(square: Array, zeta: Array) -> Array:

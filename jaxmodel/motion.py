@@ -1,12 +1,14 @@
 """Reference motion of the platform: point-to-point moves (25) and their shaped form."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxmodel.lazy import jax, jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.shaper import Taps
 from jaxmodel.table import Table
 
@@ -16,28 +18,20 @@ class Path(NamedTuple):
 
     Without moves, n = 0, the platform rests; what depends on its command alone is then computed
     once for all cases of a batch.
-
-    waypoints: poses (x, y, phi) [m, m, rad], shape (n + 1, 3).
-    move_time: duration of each move, positive [s], shape (n,).
-    dwell: pause after each move, the last one included [s], shape (n,).
-    profile: position of the time law in `PROFILES` [1], shape ().
     """
 
-    waypoints: Array
-    move_time: Array
-    dwell: Array
-    profile: Array
+    waypoints: Num[Array, "n+1 pose"]  # (x, y, phi) [m, m, rad]
+    move_time: Num[Array, "n"]  # duration of each move, positive [s]
+    dwell: Num[Array, "n"]  # pause after each move, the last one included [s]
+    profile: Num[Array, ""]  # position of the time law in `PROFILES` [1]
 
 
 class PathSample(NamedTuple):
-    """Pose of the platform with its rates, each of shape (..., 3).
+    """Pose of the platform with its rates."""
 
-    position [m, m, rad], velocity [m/s, m/s, rad/s], acceleration [m/s2, m/s2, rad/s2].
-    """
-
-    position: Array
-    velocity: Array
-    acceleration: Array
+    position: Num[Array, "... pose"]  # [m, m, rad]
+    velocity: Num[Array, "... pose"]  # [m/s, m/s, rad/s]
+    acceleration: Num[Array, "... pose"]  # [m/s2, m/s2, rad/s2]
 
 
 def move_starts(path: Path) -> Array:

@@ -11,17 +11,17 @@ from typing import NamedTuple
 
 from jaxmodel.case import Control
 from jaxmodel.lazy import jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 
 
 class Notch(NamedTuple):
-    """Coefficients of each link, (3,); z^-1 polynomials, leading denominator term 1."""
+    """Coefficients of each link; z^-1 polynomials, leading denominator term 1."""
 
-    b0: Array
-    b1: Array
-    b2: Array
-    a1: Array
-    a2: Array
+    b0: Num[Array, "links ..."]
+    b1: Num[Array, "links ..."]
+    b2: Num[Array, "links ..."]
+    a1: Num[Array, "links ..."]
+    a2: Num[Array, "links ..."]
 
 
 #: Memory of the filters, of each sensor, (3, K) each.

@@ -1,7 +1,7 @@
 """The numbers that one evaluation of the dynamics reads, computed once per case.
 
-Layout used by every per-step function: structure first, lanes last. Pose arrays have shape (3,),
-link arrays (3,), mode arrays (3, R); any further trailing axes are lanes of a batch. Link arrays
+Layout used by every per-step function: structure first, lanes last. Pose arrays have shape (pose,),
+link arrays (links,), mode arrays (links, R); any further trailing axes are lanes of a batch. Link arrays
 meet mode arrays as `x[:, None]`, sums run over axis 1 (modes) and axis 0 (links), so the same code
 runs on one case, under `vmap`, and on lanes in the last axis.
 """
@@ -13,41 +13,42 @@ from typing import NamedTuple
 from jaxmodel.beam import ModalBasis
 from jaxmodel.lazy import jnp
 from jaxmodel.mechanisms.contract import Legs
-from jaxmodel.parameters import Array, Damping, Machine
+from jaxmodel.parameters import Array, Damping, Machine, Num
 from jaxmodel.stretch import Stretch
 
 
 class Plant(NamedTuple):
-    """Machine and modal basis in the form the equations of motion use (shapes as above)."""
+    """Machine and modal basis in the form the equations of motion use (axes as above)."""
 
     legs: Legs  # paths of the near joints
-    joint_cos: Array | None  # |PC| cos(psi) [m], (n,); None: the platform is a point
-    joint_sin: Array | None  # |PC| sin(psi) [m], (n,)
-    length: Array  # L [m], (3,)
+    joint_cos: Num[Array, "links"] | None  # |PC| cos(psi) [m]; None: the platform is a point
+    joint_sin: Num[Array, "links"] | None  # |PC| sin(psi) [m]
+    length: Num[Array, "links"]  # L [m]
     # rigid inertia
-    slider_link_mass: Array  # m_b + m_s [kg], (3,)
-    tip_mass: Array  # e/L: share of the link's mass that moves with C [kg], (3,)
-    inertia: Array  # J0 [kg m2], (3,)
+    slider_link_mass: Num[Array, "links"]  # m_b + m_s [kg]
+    tip_mass: Num[Array, "links"]  # e/L: share of the link's mass that moves with C [kg]
+    inertia: Num[Array, "links"]  # J0 [kg m2]
     # platform and payload
-    platform_mass: Array  # [kg], ()
-    platform_inertia: Array  # about the reference point [kg m2], ()
-    platform_moment: Array | None  # mass times its centre in the platform's axes [kg m], (2,)
+    platform_mass: Num[Array, ""]  # [kg]
+    platform_inertia: Num[Array, ""]  # about the reference point [kg m2]
+    platform_moment: Num[Array, "2"] | None  # mass times its centre in the platform's axes [kg m]
     # modes
-    modal_mass: Array  # m, the same for all modes of a link [kg], (3,)
-    stiffness: Array  # k_j [N/m], (3, R)
-    damping: Array  # d_j = 2 zeta sqrt(k m) [N s/m], (3, R)
-    tip: Array | None  # Y_j(L) [1], (3, R), None where zero
-    shortening: Array | None  # S_jj [1/m], (3, R), None where the chord keeps its length
-    mixed_shortening: Array | None  # S_jk, zero for j = k [1/m], (3, R, R), None where all zero
-    inward: Array | None  # P_jk - mu S_jk [kg/m], (3, R, R), None where lumped at the joints
-    centrifugal: Array | None  # Q_jk [kg], (3, R, R), None likewise
-    b: Array  # [kg], (3, R)
-    c: Array  # [kg m], (3, R)
-    # elongation of a link per last coordinate, which is no mode [1], (3,); None: no such one
-    stretch: Array | None = None
-    # of joints that rub: T [N m] and speed of its tanh [rad/s], () each, slopes of the coordinates
-    # at the near and the far end [1/m], (3, R) each; None: they do not
-    joint_friction: tuple[Array, Array, Array, Array] | None = None
+    modal_mass: Num[Array, "links"]  # m, the same for all modes of a link [kg]
+    stiffness: Num[Array, "links R"]  # k_j [N/m]
+    damping: Num[Array, "links R"]  # d_j = 2 zeta sqrt(k m) [N s/m]
+    tip: Num[Array, "links R"] | None  # Y_j(L) [1], None where zero
+    shortening: Num[Array, "links R"] | None  # S_jj [1/m], None where the chord keeps its length
+    # S_jk, zero for j = k [1/m], None where all zero
+    mixed_shortening: Num[Array, "links R R"] | None
+    inward: Num[Array, "links R R"] | None  # P_jk - mu S_jk [kg/m], None where lumped at the joints
+    centrifugal: Num[Array, "links R R"] | None  # Q_jk [kg], None likewise
+    b: Num[Array, "links R"]  # [kg]
+    c: Num[Array, "links R"]  # [kg m]
+    # elongation of a link per last coordinate, which is no mode [1]; None: no such one
+    stretch: Num[Array, "links"] | None = None
+    # of joints that rub: T [N m] and speed of its tanh [rad/s], slopes of the coordinates
+    # at the near and the far end [1/m]; None: they do not
+    joint_friction: tuple[Num[Array, ""] | Num[Array, "links R"], ...] | None = None
 
 
 def damping_ratio(damping: Damping, omega: Array) -> Array:

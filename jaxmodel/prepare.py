@@ -31,7 +31,7 @@ from jaxmodel.lazy import compiled, jax, jnp
 from jaxmodel.loop import Delayed, LeftOut, Loop, Rest
 from jaxmodel.metrics import METRICS
 from jaxmodel.notch import design_notch
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.piezo import bare_stiffness, outer_faces, patch_constants, placement_faults
 from jaxmodel.plant import Plant, build_plant, damping_ratio
 from jaxmodel.static import static_remainder
@@ -58,10 +58,10 @@ class Prepared(NamedTuple):
     loop: Loop
     bases: Bases  # the modal bases it is built from
     taps: shaper.Taps  # shaper on the sample grid
-    initial_q: Array  # [m], (3, R)
-    sensor_condition: Array  # condition number of the modal filter per link [1], (3,)
-    actuator_condition: Array  # of the synthesizer [1], (3,)
-    status: Array  # fault found before the run, as a float, ()
+    initial_q: Num[Array, "links R"]  # [m]
+    sensor_condition: Num[Array, "links"]  # condition number of the modal filter per link [1]
+    actuator_condition: Num[Array, "links"]  # of the synthesizer [1]
+    status: Num[Array, ""]  # fault found before the run, as a float
 
 
 class ControllerDesign(NamedTuple):
@@ -69,9 +69,9 @@ class ControllerDesign(NamedTuple):
 
     controller: Controller
     nominal: NominalModel
-    modal_omega: Array  # frequencies of the controller's own modes [rad/s], (3, C)
-    sensor_condition: Array  # (3,)
-    actuator_condition: Array  # (3,)
+    modal_omega: Num[Array, "links C"]  # frequencies of the controller's own modes [rad/s]
+    sensor_condition: Num[Array, "links"]
+    actuator_condition: Num[Array, "links"]
 
 
 @compiled("structure")

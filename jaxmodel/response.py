@@ -23,7 +23,7 @@ from jaxmodel.kinematics import close_chain
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.linear import flatten, linearise, resting
 from jaxmodel.loop import Loop, PlantState, plant_rates
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.piezo import patch_constants
 from jaxmodel.plant import damping_ratio
 from jaxmodel.prepare import Prepared, prepare
@@ -36,21 +36,21 @@ class BenchPlant(NamedTuple):
     the elongations.
     """
 
-    state: Array  # A [1/s and mixed], (n, n)
-    actuator: Array  # (B_0, B_2) of the voltages on the actuators, (2, n, 3 K)
-    slider_force: Array  # of forces on the actuated joints, (2, n, 3)
-    hammer: Array  # of forces across the links at the stations, (2, n, 3 S)
-    sensor: Array  # voltages of the sensors [V], (3 K, n)
-    deflection: Array  # chord deflection at the stations [m], (3 S, n)
-    across: Array  # of a point at a station in the plane, across its link [m], (3 S, n)
-    along: Array  # the same along its link [m], (3 S, n)
-    slider: Array  # actuated coordinates [m], (3, n)
-    pose: Array  # [m, m, rad], (3, n)
+    state: Num[Array, "n n"]  # A [1/s and mixed]
+    actuator: Num[Array, "2 n links*K"]  # (B_0, B_2) of the voltages on the actuators
+    slider_force: Num[Array, "2 n links"]  # of forces on the actuated joints
+    hammer: Num[Array, "2 n links*S"]  # of forces across the links at the stations
+    sensor: Num[Array, "links*K n"]  # voltages of the sensors [V]
+    deflection: Num[Array, "links*S n"]  # chord deflection at the stations [m]
+    across: Num[Array, "links*S n"]  # of a point at a station in the plane, across its link [m]
+    along: Num[Array, "links*S n"]  # the same along its link [m]
+    slider: Num[Array, "links n"]  # actuated coordinates [m]
+    pose: Num[Array, "pose n"]  # [m, m, rad]
     # D of sensors [V], then of deflections [m], by the modes that are left out; 0 for other outputs
-    from_actuator: Array  # (3 (K + S), 3 K)
-    from_slider_force: Array  # (3 (K + S), 3)
-    from_hammer: Array  # (3 (K + S), 3 S)
-    drive: Array  # proportional and derivative gain of the drives [N/m, N s/m], (2, 3)
+    from_actuator: Num[Array, "links*(K+S) links*K"]
+    from_slider_force: Num[Array, "links*(K+S) links"]
+    from_hammer: Num[Array, "links*(K+S) links*S"]
+    drive: Num[Array, "2 links"]  # proportional and derivative gain of the drives [N/m, N s/m]
 
 
 def bench_plant(structure: Structure, case: Case, pose: Array) -> BenchPlant:
@@ -113,10 +113,11 @@ def bench_plant(structure: Structure, case: Case, pose: Array) -> BenchPlant:
 class _LeftOut(NamedTuple):
     """What modes that are left out do; zero where the model is truncated."""
 
-    by_force: Array  # to sensors, then deflections, by forces at the stations, (3 (K + S), 3 S)
-    by_motion: Array  # the same by accelerations of y = (X, q), (3 (K + S), m)
-    hammer_wrench: Array  # on y per second derivative of such forces, (m, 3 S)
-    actuator_wrench: Array  # of the actuators' voltages, (m, 3 K)
+    # to sensors, then deflections, by forces at the stations
+    by_force: Num[Array, "links*(K+S) links*S"]
+    by_motion: Num[Array, "links*(K+S) m"]  # the same by accelerations of y = (X, q)
+    hammer_wrench: Num[Array, "m links*S"]  # on y per second derivative of such forces
+    actuator_wrench: Num[Array, "m links*K"]  # of the actuators' voltages
 
 
 def _left_out(structure: Structure, case: Case, prepared: Prepared, pose: Array) -> _LeftOut:

@@ -23,7 +23,7 @@ from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import Loop
 from jaxmodel.notch import Notch
 from jaxmodel.pairs import Pair, determinant, product
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.trigonometry import sine_cosine
 
 #: Images n of the spectrum that are summed; those left out change the sum by 1e-4.
@@ -37,7 +37,7 @@ NARROWEST = 1e-6
 class Lateness(NamedTuple):
     """Delay of the commands beyond one sample."""
 
-    time: Array  # tau [s], ()
+    time: Num[Array, ""]  # tau [s]
     images: Pair  # exp(-j 2 pi n tau/T) of `IMAGES` and `FAR`
 
 
@@ -47,31 +47,31 @@ class LoopResponse(NamedTuple):
     The first n links have channels: all three, or those under control, see `controlled_first`.
     """
 
-    mass: Array  # of the pose with straight links, (3, 3)
-    damping: Array  # of the drive in the pose, (3, 3)
-    stiffness: Array  # (3, 3)
-    square: Array  # omega^2 of the modes of a link with held ends [1/s2], (3, R)
-    decay: Array  # 2 zeta omega [1/s], (3, R)
-    lightness: Array  # inertia left to a mode that drags only the pose's mass [1], (3, R)
+    mass: Num[Array, "pose pose"]  # of the pose with straight links
+    damping: Num[Array, "pose pose"]  # of the drive in the pose
+    stiffness: Num[Array, "pose pose"]
+    square: Num[Array, "links R"]  # omega^2 of the modes of a link with held ends [1/s2]
+    decay: Num[Array, "links R"]  # 2 zeta omega [1/s]
+    lightness: Num[Array, "links R"]  # inertia left to a mode that drags only the pose's mass [1]
     # of elongations, the ports and the two motions by which they move modes: see `PlantResponse`
-    longer: tuple[Array, Array, Array] | None
-    heavy: Array | None  # mass that an elongation feels above all frequencies [kg], (3,)
-    port: Array  # (3, 2, P)
-    enter: Array  # (3, 2, R)
-    leave: Array  # (3, 2, R)
-    push: Array  # force on an elongation per channel force, (n, C); None without elongations
-    read: Array  # channels per elongation, (n, C); None likewise
-    observe: Array  # channels per modal coordinate, (n, C, R)
-    act: Array  # on the modes per channel force, (n, C, R)
-    direct: Array  # by modes that are left out, channels per channel force, (n, C, C)
-    feedthrough: Array  # compensated, the same way, (n, C, C)
+    longer: tuple[Num[Array, "links pose+1"], ...] | None
+    heavy: Num[Array, "links"] | None  # mass that an elongation feels above all frequencies [kg]
+    port: Num[Array, "links 2 P"]
+    enter: Num[Array, "links 2 R"]
+    leave: Num[Array, "links 2 R"]
+    push: Num[Array, "n C"]  # force on an elongation per channel force; None without elongations
+    read: Num[Array, "n C"]  # channels per elongation; None likewise
+    observe: Num[Array, "n C R"]  # channels per modal coordinate
+    act: Num[Array, "n C R"]  # on the modes per channel force
+    direct: Num[Array, "n C C"]  # by modes that are left out, channels per channel force
+    feedthrough: Num[Array, "n C C"]  # compensated, the same way
     estimator: Estimator
-    velocity_gain: Array  # (n, C)
-    position_gain: Array | None
-    period: Array  # T [s], ()
-    antialias: Array  # [rad/s], ()
-    highpass: Array | None  # of the patches [rad/s], None if there is none, ()
-    lag: Array | None  # of the amplifiers [s], None if there are none, ()
+    velocity_gain: Num[Array, "n C"]
+    position_gain: Num[Array, "n C"] | None
+    period: Num[Array, ""]  # T [s]
+    antialias: Num[Array, ""]  # [rad/s]
+    highpass: Num[Array, ""] | None  # of the patches [rad/s], None if there is none
+    lag: Num[Array, ""] | None  # of the amplifiers [s], None if there are none
     late: Lateness | None = None  # None: the delay is one sample
     notch: Notch | None = None  # of the links with channels, (n, 1) each
 
@@ -199,12 +199,12 @@ def controlled_first(response: LoopResponse, link_mask: Array, count: int) -> Lo
 class AssembledModes(NamedTuple):
     """Modes of the uncontrolled machine, m = p + n R; damping to first order."""
 
-    omega: Array  # ascending [rad/s], (m,)
-    decay: Array  # zeta omega [1/s], (m,)
-    share: Array  # of kinetic energy in the pose, then in the links' modes by order, (1 + R, m)
-    growth: Array  # growth rate of an unstable rest, 0: stable [1/s], ()
-    shape: Array  # coordinates of the links' modes in each, of modal mass 1, (n, R, m)
-    rigid: Array  # pose, and elongations if links lengthen, (p, m)
+    omega: Num[Array, "m"]  # ascending [rad/s]
+    decay: Num[Array, "m"]  # zeta omega [1/s]
+    share: Num[Array, "1+R m"]  # of kinetic energy in the pose, then in the links' modes by order
+    growth: Num[Array, ""]  # growth rate of an unstable rest, 0: stable [1/s]
+    shape: Num[Array, "n R m"]  # coordinates of the links' modes in each, of modal mass 1
+    rigid: Num[Array, "p m"]  # pose, and elongations if links lengthen
 
 
 def pose_coupling(whole: Assembled, xp: Any = jnp) -> Array:

@@ -21,7 +21,7 @@ from jaxmodel.frequency_response import (
 )
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop_figures import MOST_DELAY, MOST_PHASE, PEAKS
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.return_difference import NARROWEST, assembled_modes
 from jaxmodel.scaling import best_scaling
 from jaxmodel.state_space import StateSpace
@@ -38,9 +38,9 @@ ZOOMS, POINTS = 4, 5
 class MarginPlace(NamedTuple):
     """Where a margin is, from a search."""
 
-    value: Array  # the margin in its unit, ()
-    omega: Array  # [rad/s], ()
-    sign: Array  # of the phase, 1 or -1; otherwise 1, ()
+    value: Num[Array, ""]  # the margin in its unit
+    omega: Num[Array, ""]  # [rad/s]
+    sign: Num[Array, ""]  # of the phase, 1 or -1; otherwise 1
 
 
 def margin_at(response: SampledLoopResponse, name: str, place: MarginPlace) -> Array:

@@ -25,7 +25,7 @@ from jaxmodel.exponential import exponential
 from jaxmodel.lazy import compiled, jax, jnp
 from jaxmodel.linear import LinearPlant, Moment, linearise, resting
 from jaxmodel.loop import Loop
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Int, Num
 from jaxmodel.prepare import prepare
 
 #: A spectral radius this far above 1 is unstable; free rigid modes sit at 1 up to rounding.
@@ -38,15 +38,15 @@ class LoopMatrices(NamedTuple):
     The state is (X, X', q, q', electronics, controller, sampled drive).
     """
 
-    open: Array  # all gains zero, (n, n)
-    feedback: Array  # what the gains add, (n, n)
-    plant: Array  # A of the continuous uncontrolled plant with drive, for its poles, (m, m)
-    force: Array  # response to forces on the joints held over the sample, (n, 3)
-    motor: Array  # the same to commands of the motors, (n, 3)
-    deflection: Array  # chord deflection at the stations [m], rows, (3 S, n)
+    open: Num[Array, "n n"]  # all gains zero
+    feedback: Num[Array, "n n"]  # what the gains add
+    plant: Num[Array, "m m"]  # A of the continuous uncontrolled plant with drive, for its poles
+    force: Num[Array, "n links"]  # response to forces on the joints held over the sample
+    motor: Num[Array, "n links"]  # the same to commands of the motors
+    deflection: Num[Array, "links*S n"]  # chord deflection at the stations [m], rows
     # response of a sampled drive's state to the reference of the joints, positions [m], then
-    # speeds [m/s], (n, 2 l); None: the drive acts in continuous time
-    reference: Array | None = None
+    # speeds [m/s]; None: the drive acts in continuous time
+    reference: Num[Array, "n 2*links"] | None = None
 
     def state_space(self, factor: Array = 1.0) -> tuple[Array, Array, Array, Array]:
         """A, B, C, D per sample, from forces on the actuated joints to chord deflections.
@@ -233,11 +233,11 @@ class DelayedParts(NamedTuple):
     u_(k-LONGEST).
     """
 
-    matrix: Array  # transition, 0 for plant and electronics, (m, m)
-    state: Array  # A of plant and electronics, (n, n)
-    enters: Array  # B of commands and motors' commands, (n, 3 K + 3)
-    commands: Array  # place of every command u_(k-1) in the state, (3 K,), integers
-    forces: Array | None  # place of the forces that a sampled drive holds, (3,), integers
+    matrix: Num[Array, "m m"]  # transition, 0 for plant and electronics
+    state: Num[Array, "n n"]  # A of plant and electronics
+    enters: Num[Array, "n links*(K+1)"]  # B of commands and motors' commands
+    commands: Int[Array, "links*K"]  # place of every command u_(k-1) in the state
+    forces: Int[Array, "links"] | None  # place of the forces that a sampled drive holds
 
 
 def delayed_parts(structure: Structure, case: Case, loop: Loop, pose: Array) -> DelayedParts:
@@ -287,9 +287,9 @@ class SampledPlant(NamedTuple):
     commands that are held.
     """
 
-    state: Array  # A, (n, n)
-    enter: Array  # B, (n, 3 K)
-    leave: Array  # C, (3 K, n)
+    state: Num[Array, "n n"]  # A
+    enter: Num[Array, "n links*K"]  # B
+    leave: Num[Array, "links*K n"]  # C
 
 
 def sampled_plant(structure: Structure, case: Case, pose: Array) -> SampledPlant:
@@ -334,10 +334,9 @@ def sampled_plant(structure: Structure, case: Case, pose: Array) -> SampledPlant
 class AnaloguePlant(NamedTuple):
     """Plant and electronics between two samples."""
 
-    state: Array  # A, (n, n)
-    # B of commands, of motors' commands and, where these are late, of forces on the joints,
-    # (n, 3 K + 3) or (n, 3 K + 6)
-    enters: Array
+    state: Num[Array, "n n"]  # A
+    # B of commands, of motors' commands and, where these are late, of forces on the joints
+    enters: Num[Array, "n links*(K+1)"] | Num[Array, "n links*(K+2)"]
     filtered: slice  # of the state: what the converters see
     voltage: slice | None  # of the state: on the actuators; None: the command itself
 
@@ -345,10 +344,10 @@ class AnaloguePlant(NamedTuple):
 class _Sampled(NamedTuple):
     """Exact over a sample; commands on their way are part of the state, u_(k-2) first."""
 
-    held: Array  # by the state and u_(k-1), (n, n + 3 K)
-    newest: Array | None  # by u_k, if its delay can be below a sample, (n, 3 K)
-    force: Array  # by motors' commands, then forces on the joints, held over the sample, (n, ..)
-    present: Array  # command on the actuators, of state and u_(k-1), (3 K, n + 3 K)
+    held: Num[Array, "n n+links*K"]  # by the state and u_(k-1)
+    newest: Num[Array, "n links*K"] | None  # by u_k, if its delay can be below a sample
+    force: Num[Array, "n _"]  # by motors' commands, then forces on the joints, held over the sample
+    present: Num[Array, "links*K n+links*K"]  # command on the actuators, of state and u_(k-1)
 
 
 def _over_a_sample(structure: Structure, analogue: AnaloguePlant, case: Case) -> _Sampled:
@@ -520,8 +519,8 @@ DOUBLINGS = 13
 class Summed(NamedTuple):
     """sum over k of M^k S M'^k, as share * exp(log_size) lest it overflow."""
 
-    share: Array  # trace 1, (n, n)
-    log_size: Array  # ()
+    share: Num[Array, "n n"]  # trace 1
+    log_size: Num[Array, ""]
 
 
 def summed_squares(matrix: Array, start: Array) -> Summed:

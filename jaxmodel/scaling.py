@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.lazy import jax, jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Complex, Num
 
 #: Sweeps that balance rows against columns, and steps of the method of centres.
 SWEEPS, STEPS = 6, 64
@@ -28,9 +28,9 @@ CENTRED, WIDEST = 0.5, 25.0
 class BestScaling(NamedTuple):
     """Of a matrix M."""
 
-    bound: Array  # smallest largest singular value of D M D^-1, ()
-    log_scale: Array  # ln of D's diagonal, (n,)
-    slope: Array  # G: the bound changes by Re sum(conj(G) dM), complex, (n, n)
+    bound: Num[Array, ""]  # smallest largest singular value of D M D^-1
+    log_scale: Num[Array, "n"]  # ln of D's diagonal
+    slope: Complex[Array, "n n"]  # G: the bound changes by Re sum(conj(G) dM)
 
 
 def _balance(matrix: Array, sweeps: int = SWEEPS) -> Array:

@@ -5,6 +5,8 @@ Singhose, Seering and Singer 1994 (EI); Singhose, Porter, Tuttle and Singer 1997
 humps); the paper, section 3.1.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from math import comb
 from typing import NamedTuple
@@ -12,18 +14,18 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.lazy import jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.table import Table
 
 
 class Impulses(NamedTuple):
-    """A shaper: amplitude [1] and time [s] of each impulse, both of shape (n,).
+    """A shaper: n impulses.
 
     An impulse of zero amplitude is padding and has no effect anywhere.
     """
 
-    amplitude: Array
-    time: Array
+    amplitude: Num[Array, "n"]  # [1]
+    time: Num[Array, "n"]  # [s]
 
 
 class Shaper(NamedTuple):
@@ -35,10 +37,10 @@ class Shaper(NamedTuple):
 
 
 class Taps(NamedTuple):
-    """A shaper on the sample grid: weight [1] and delay `sample` [samples], both of shape (m,)."""
+    """A shaper on the sample grid, m taps."""
 
-    weight: Array
-    sample: Array
+    weight: Num[Array, "m"]  # [1]
+    sample: Num[Array, "m"]  # delay [samples]
 
 
 def _root(x: Array) -> Array:

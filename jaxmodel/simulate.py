@@ -19,7 +19,7 @@ from jaxmodel.kinematics import inverse_kinematics, path_status, singularity_dis
 from jaxmodel.lazy import compiled, jax, jnp
 from jaxmodel.loop import Inputs, Loop, Record, State, step
 from jaxmodel.motion import end_of_path, shape_path
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Int, Num
 from jaxmodel.plant import Plant
 from jaxmodel.prepare import Prepared, prepare
 from jaxmodel.shaper import last_sample
@@ -31,12 +31,12 @@ class RunResult(NamedTuple):
     # NaN if the run did not finish; derivatives are 0 then, so that a sum over the cases of a batch
     # that masks those by `status` has the right derivative
     metrics: metrics.Metrics
-    status: Array  # code of `jaxmodel.status`, integer, ()
-    bad_time: Array  # when it appeared [s], 0 if OK or wrong from the start, ()
-    command_end: Array  # end of the shaped reference [s], ()
-    sensor_condition: Array  # condition number of the modal filter per link [1], (3,)
-    actuator_condition: Array  # of the synthesizer [1], (3,)
-    singularity_distance: Array  # of the path from poses no drive reaches or holds [rad], ()
+    status: Int[Array, ""]  # code of `jaxmodel.status`
+    bad_time: Num[Array, ""]  # when it appeared [s], 0 if OK or wrong from the start
+    command_end: Num[Array, ""]  # end of the shaped reference [s]
+    sensor_condition: Num[Array, "links"]  # condition number of the modal filter per link [1]
+    actuator_condition: Num[Array, "links"]  # of the synthesizer [1]
+    singularity_distance: Num[Array, ""]  # of the path from poses no drive reaches or holds [rad]
     record: Record | None  # trajectories, leading axis (n_steps,), if asked for
 
 
@@ -44,11 +44,11 @@ class Command(NamedTuple):
     """Everything that enters the loop from outside, for all samples."""
 
     inputs: Inputs  # leading axis (n_steps,)
-    start_pose: Array  # (3,)
-    end: Array  # end of the shaped reference [s], ()
-    status: Array  # reach, singularity or length fault of the command, as a float, ()
-    bad_time: Array  # when it appears [s], ()
-    singularity_distance: Array  # of the path from poses no drive reaches or holds [rad], ()
+    start_pose: Num[Array, "pose"]
+    end: Num[Array, ""]  # end of the shaped reference [s]
+    status: Num[Array, ""]  # reach, singularity or length fault of the command, as a float
+    bad_time: Num[Array, ""]  # when it appears [s]
+    singularity_distance: Num[Array, ""]  # of the path from poses no drive reaches or holds [rad]
 
 
 @compiled("structure")
@@ -233,19 +233,19 @@ def _scan_in_blocks(body: Any, start: Any, inputs: Inputs, is_checkpointed: bool
 class Outline(NamedTuple):
     """What is known about a case before its first step."""
 
-    early_time: Array  # when a fault of the command appears [s], ()
-    command_end: Array  # [s], ()
-    sensor_condition: Array  # (3,)
-    actuator_condition: Array  # (3,)
+    early_time: Num[Array, ""]  # when a fault of the command appears [s]
+    command_end: Num[Array, ""]  # [s]
+    sensor_condition: Num[Array, "links"]
+    actuator_condition: Num[Array, "links"]
     ending: metrics.Ending
-    saturation_limit: Array  # [1], ()
-    arrival_tolerance: Array  # [m], ()
-    critical_force: Array  # N_cr of the links [N], (3,)
-    # largest distance of a joint from the platform's reference point [m], (); None: it is a point
-    joint_radius: Array | None
-    singularity_distance: Array  # [rad], ()
-    singularity_margin: Array  # [rad], ()
-    strain_limit: Array  # [1], ()
+    saturation_limit: Num[Array, ""]  # [1]
+    arrival_tolerance: Num[Array, ""]  # [m]
+    critical_force: Num[Array, "links"]  # N_cr of the links [N]
+    # largest distance of a joint from the platform's reference point [m]; None: it is a point
+    joint_radius: Num[Array, ""] | None
+    singularity_distance: Num[Array, ""]  # [rad]
+    singularity_margin: Num[Array, ""]  # [rad]
+    strain_limit: Num[Array, ""]  # [1]
 
 
 class Start(NamedTuple):

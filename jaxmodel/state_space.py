@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.lazy import jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 
 #: Condition number of the largest similarity that keeps enough digits [1].
 WORST_CONDITION = 1e7
@@ -29,11 +29,11 @@ class StateSpace(NamedTuple):
     Each has M sensors and as many actuators: all n K of the machine, or the K of its link.
     """
 
-    state: Array  # A, (G, N, b, b)
-    enter: Array  # B, state per sensor volt, (G, N, b, M)
-    leave: Array  # C, actuator volts per state, (G, M, N, b)
-    direct: Array  # D [1], (G, M, M)
-    anti_windup: Array | None = None  # E, state per volt that a limit adds, (G, N, b, M); None: 0
+    state: Num[Array, "G N b b"]  # A
+    enter: Num[Array, "G N b M"]  # B, state per sensor volt
+    leave: Num[Array, "G M N b"]  # C, actuator volts per state
+    direct: Num[Array, "G M M"]  # D [1]
+    anti_windup: Num[Array, "G N b M"] | None = None  # E, state per volt that a limit adds; None: 0
 
     @property
     def has_output(self) -> bool:

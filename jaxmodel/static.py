@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jaxmodel.lazy import jnp
-from jaxmodel.parameters import Array, Beam, Patches
+from jaxmodel.parameters import Array, Beam, Num, Patches
 from jaxmodel.piezo import (
     bare_stiffness,
     one_sided_section,
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 class Pieces(NamedTuple):
     """A link in n pieces between the ends of its patches, each of constant section."""
 
-    left: Array  # [m], (n,)
-    right: Array  # [m], (n,)
-    has_sensor: Array  # 1 where sensor k covers it, else 0, (K, n)
-    has_actuator: Array  # 1 where actuator k covers it, else 0, (K, n)
-    has_ceramic: Array  # 1 where a sensor that is a patch covers it, else 0, (K, n)
+    left: Num[Array, "n"]  # [m]
+    right: Num[Array, "n"]  # [m]
+    has_sensor: Num[Array, "K n"]  # 1 where sensor k covers it, else 0
+    has_actuator: Num[Array, "K n"]  # 1 where actuator k covers it, else 0
+    has_ceramic: Num[Array, "K n"]  # 1 where a sensor that is a patch covers it, else 0
 
 
 def link_pieces(beam: Beam, patches: Patches, places: Array = ()) -> Pieces:

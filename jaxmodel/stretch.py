@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxmodel.beam import by_link
 from jaxmodel.lazy import jax, jnp
-from jaxmodel.parameters import Array, Beam, Damping, Patches
+from jaxmodel.parameters import Array, Beam, Damping, Num, Patches
 from jaxmodel.piezo import actuator_force, own_factors, sensor_gain
 from jaxmodel.static import Pieces, link_pieces, patch_count, section_mass
 
@@ -26,13 +26,14 @@ REFERENCE = 2 * np.pi * 1500.0
 class Stretch(NamedTuple):
     """Of all links; K pairs of patches each."""
 
-    stiffness: Array  # 1/Lambda [N/m], (3,)
-    damping: Array  # of the rate of e, in proportion to stiffness [N s/m], (3,)
-    mass: Array  # int rhoA s^2 dx with the displacement s e, s(0) = 0 and s(L) = 1 [kg], (3,)
-    free: Array  # elongation per volt without tension [m/V], (3, K)
-    strain: Array  # mean over each sensor per newton of tension [1/N], (3, K)
-    local: Array  # the same per actuator volt without tension [1/V], (3, K, K)
-    volts: Array  # of a sensor at such a strain of 1 [V], (3, K)
+    stiffness: Num[Array, "links"]  # 1/Lambda [N/m]
+    damping: Num[Array, "links"]  # of the rate of e, in proportion to stiffness [N s/m]
+    # int rhoA s^2 dx with the displacement s e, s(0) = 0 and s(L) = 1 [kg]
+    mass: Num[Array, "links"]
+    free: Num[Array, "links K"]  # elongation per volt without tension [m/V]
+    strain: Num[Array, "links K"]  # mean over each sensor per newton of tension [1/N]
+    local: Num[Array, "links K K"]  # the same per actuator volt without tension [1/V]
+    volts: Num[Array, "links K"]  # of a sensor at such a strain of 1 [V]
 
 
 def axial_stiffness(beam: Beam, patches: Patches, pieces: Pieces, has_patches: bool) -> Array:

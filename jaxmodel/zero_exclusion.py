@@ -24,7 +24,7 @@ from jaxmodel.discs import (
 )
 from jaxmodel.modal_loop import LawPoles, ModalLoop, law_poles, law_response
 from jaxmodel.mode_tail import Tail, bound_tail, least_denominator, pose_scale, static_rest
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 
 #: Images on either side whose direct responses are evaluated rather than bounded.
 NEAR = 2
@@ -42,8 +42,8 @@ class Exclusion(NamedTuple):
     tail: Tail  # sizes zero: the model's modes only
     base: int  # modes that are evaluated
     low: int  # of them, those that are unknowns of F
-    middle: Array  # half the static answer of sensors to the pose beyond the base modes, (U, p)
-    rest: Array  # static answer beside the low modes, (3, K, K)
+    middle: Num[Array, "U p"]  # half the static answer of sensors to the pose beyond the base modes
+    rest: Num[Array, "links K K"]  # static answer beside the low modes
     images: list[Array]  # of the tail, maxima over 1, 2, 4, ... slices
 
 

@@ -17,15 +17,15 @@ import numpy as np
 
 from jaxmodel.case import Drive
 from jaxmodel.lazy import jax, jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.table import Parameter, PartError, check_parameters, is_real
 
 
 class SliderError(NamedTuple):
-    """Reference less measured motion of the actuated joints, (3,) each."""
+    """Reference less measured motion of the actuated joints."""
 
-    position: Array  # e = rho_d - rho [m]
-    rate: Array  # e' [m/s]
+    position: Num[Array, "links"]  # e = rho_d - rho [m]
+    rate: Num[Array, "links"]  # e' [m/s]
 
 
 class DriveLaw(NamedTuple):
@@ -48,17 +48,17 @@ class DriveLaw(NamedTuple):
 
 
 class DriveState(NamedTuple):
-    """What a sampled drive carries from sample to sample, (3,) each."""
+    """What a sampled drive carries from sample to sample."""
 
-    force: Array  # F_fb held over this sample [N]
-    memory: Array | None  # None: the law has no `update`
+    force: Num[Array, "links"]  # F_fb held over this sample [N]
+    memory: Num[Array, "links"] | None  # None: the law has no `update`
 
 
 class DriveGains(NamedTuple):
-    """First derivatives of F_fb at rest, (3,) each."""
+    """First derivatives of F_fb at rest."""
 
-    position: Array  # by e [N/m]
-    rate: Array  # by e' [N s/m]
+    position: Num[Array, "links"]  # by e [N/m]
+    rate: Num[Array, "links"]  # by e' [N s/m]
 
 
 def check_drive(law: DriveLaw) -> None:

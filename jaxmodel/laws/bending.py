@@ -14,7 +14,7 @@ from typing import NamedTuple
 from jaxmodel.case import Case
 from jaxmodel.laws.link_model import LinkModel
 from jaxmodel.lazy import jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.table import Parameter
 
 #: Corner of the model of the force over `bending_hz` [1]: behind drained patches, which show
@@ -36,7 +36,7 @@ class BentModel(NamedTuple):
     """A link model with the slow modal forces as last states, leading axis 3."""
 
     model: LinkModel  # of n + C states
-    compliance: Array  # X, state about which the link vibrates per modal force, (3, n, C)
+    compliance: Num[Array, "links n C"]  # X, state about which the link vibrates per modal force
 
     def relative(self, gain: Array) -> Array:
         """K of u = -K (x - X d) as a gain of all states, (3, K, n + C)."""

@@ -18,7 +18,7 @@ from jaxmodel.control import force_gains
 from jaxmodel.controller import Feedback
 from jaxmodel.estimator import Estimator, design_estimator
 from jaxmodel.lazy import jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.state_space import StateSpace
 from jaxmodel.table import Parameter, PartError, check_parameters
 
@@ -29,15 +29,16 @@ Channel = Literal["mode", "patch", "none"]
 class NominalModel(NamedTuple):
     """What a law can use: the controller's model of the machine."""
 
-    observer: Array  # modal filter pinv(lambda_s Phi_s^t) of the controlled modes [m/V], (3, C, K)
-    synthesizer: Array  # pinv(lambda_a Phi_a), voltages from modal forces [V/N], (3, K, C)
-    sensor: Array  # lambda_s Phi_s^t, voltages of modal coordinates [V/m], (3, K, C)
-    actuator: Array  # lambda_a Phi_a, modal forces of voltages [N/V], (3, C, K)
-    omega: Array  # frequencies of the assembled links [rad/s], (3, C)
-    damping_ratio: Array  # of the same modes without control [1], (3, C)
-    modal_mass: Array  # [kg], (3, C)
-    mask: Array  # 1 for controlled modes, at most as many as patches, (C,)
-    feedthrough: Array  # sensor volts per actuator volt by all other modes [V/V], (3, K, K)
+    # modal filter pinv(lambda_s Phi_s^t) of the controlled modes [m/V]
+    observer: Num[Array, "links C K"]
+    synthesizer: Num[Array, "links K C"]  # pinv(lambda_a Phi_a), voltages from modal forces [V/N]
+    sensor: Num[Array, "links K C"]  # lambda_s Phi_s^t, voltages of modal coordinates [V/m]
+    actuator: Num[Array, "links C K"]  # lambda_a Phi_a, modal forces of voltages [N/V]
+    omega: Num[Array, "links C"]  # frequencies of the assembled links [rad/s]
+    damping_ratio: Num[Array, "links C"]  # of the same modes without control [1]
+    modal_mass: Num[Array, "links C"]  # [kg]
+    mask: Num[Array, "C"]  # 1 for controlled modes, at most as many as patches
+    feedthrough: Num[Array, "links K K"]  # sensor volts per actuator volt by all other modes [V/V]
 
 
 class Law(NamedTuple):

@@ -18,7 +18,7 @@ from jaxmodel.delay import LONGEST, CommandChange, command_change
 from jaxmodel.exponential import exponential
 from jaxmodel.laws.contract import NominalModel, system_feedback
 from jaxmodel.lazy import jax, jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.state_space import StateSpace
 from jaxmodel.table import Parameter
 
@@ -31,13 +31,13 @@ DAMPING = Parameter(
 class LinkModel(NamedTuple):
     """One link over a sample: x_(k+1) = F x + G u + W f, y = C x; x ends with the last command."""
 
-    state: Array  # F, (n, n)
-    enter: Array  # G, (n, K)
-    drive: Array  # W, state per modal force held over the sample [sqrt(J)/N], (n, C)
-    sensor: Array  # C [V/sqrt(J)], (K, n)
-    energy: Array  # diagonal of the modes' energy, 1 for their two states, (n,)
-    met: Array  # what the next command meets when it arrives, of x, (n, n)
-    held: Array  # state by a command on the actuators for a whole sample, (n, K)
+    state: Num[Array, "n n"]  # F
+    enter: Num[Array, "n K"]  # G
+    drive: Num[Array, "n C"]  # W, state per modal force held over the sample [sqrt(J)/N]
+    sensor: Num[Array, "K n"]  # C [V/sqrt(J)]
+    energy: Num[Array, "n"]  # diagonal of the modes' energy, 1 for their two states
+    met: Num[Array, "n n"]  # what the next command meets when it arrives, of x
+    held: Num[Array, "n K"]  # state by a command on the actuators for a whole sample
 
 
 def link_model(structure: Structure, case: Case, nominal: NominalModel) -> LinkModel:
@@ -166,10 +166,10 @@ def _first_command(at: dict[str, slice]) -> int:
 class _Moves(NamedTuple):
     """A link over a sample."""
 
-    whole: Array  # with everything held, (n, n + K + C)
-    state: Array  # with the commands that it has, see `LinkModel`
-    enter: Array
-    met: Array
+    whole: Num[Array, "n n+K+C"]  # with everything held
+    state: Num[Array, "n n"]  # with the commands that it has, see `LinkModel`
+    enter: Num[Array, "n K"]
+    met: Num[Array, "n n"]
 
 
 def _moves(

@@ -24,7 +24,7 @@ from jaxmodel.laws.contract import NominalModel, acting_channels, study_estimato
 from jaxmodel.laws.link_model import LinkModel, mode_models
 from jaxmodel.lazy import jnp
 from jaxmodel.notch import Notch, design_notch, notch_response
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 
 #: Added decay over omega below which a mode is left alone [1].
 LEAST_SHIFT = 1e-9
@@ -35,8 +35,8 @@ LEAST_ANGLE = 1e-4
 class Poles(NamedTuple):
     """Poles -decay +- j frequency of the controlled modes."""
 
-    decay: Array  # alpha [1/s], (3, C)
-    frequency: Array  # beta [rad/s], (3, C)
+    decay: Num[Array, "links C"]  # alpha [1/s]
+    frequency: Num[Array, "links C"]  # beta [rad/s]
 
 
 def specified_poles(case: Case, nominal: NominalModel) -> Poles:

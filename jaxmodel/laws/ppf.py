@@ -16,7 +16,7 @@ from jaxmodel.electronics import measurement_chain
 from jaxmodel.estimator import Estimator, second_order
 from jaxmodel.laws.contract import Law, NominalModel, modal_feedback, study_gains
 from jaxmodel.lazy import jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.table import Parameter
 
 #: Highest corner over the assembled frequency, used where the chain itself lags by 90 degrees [1].
@@ -26,11 +26,12 @@ HIGHEST_SHARE = 0.9
 
 
 class PositionFilter(NamedTuple):
-    """Filters of positive position feedback, (3, C) each."""
+    """Filters of positive position feedback."""
 
     estimator: Estimator  # its position is the filter's output
-    corner: Array  # omega_f [rad/s]
-    damping: Array  # k_d at the assembled frequency per unit of g, delays included [s]
+    corner: Num[Array, "links C"]  # omega_f [rad/s]
+    # k_d at the assembled frequency per unit of g, delays included [s]
+    damping: Num[Array, "links C"]
 
 
 def design_position_filter(omega: Array, zeta: Array, electronics: Electronics) -> PositionFilter:

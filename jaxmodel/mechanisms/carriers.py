@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 
 
 class Rail(NamedTuple):
     """A straight rail; B is on its slider, and C lies ahead of B."""
 
-    start: Array  # where rho = 0 [m], (2,)
-    direction: Array  # in which rho grows [1], (2,)
+    start: Num[Array, "2"]  # where rho = 0 [m]
+    direction: Num[Array, "2"]  # in which rho grows [1]
     length: Array  # [m]
     mass: Array  # of the slider [kg]
 
@@ -29,7 +29,7 @@ class Rail(NamedTuple):
 class Crank(NamedTuple):
     """A rigid crank, turned by a motor at its pivot; B is at its end."""
 
-    pivot: Array  # [m], (2,)
+    pivot: Num[Array, "2"]  # [m]
     length: Array  # a [m]
     zero_angle: Array  # its direction where rho = 0 [rad]
     # 1: C lies to its left and rho grows against the clock, -1: to its right, and with the clock

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxmodel.lazy import jnp
 from jaxmodel.mechanisms.carriers import Carrier
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 from jaxmodel.table import Parameter
 
 
@@ -40,18 +40,20 @@ class Mechanism(NamedTuple):
 
 
 class Near(NamedTuple):
-    """The near joints B of the links for given far joints C, (n,) each.
+    """The near joints B of the links for given far joints C.
 
     u is the direction in which B moves, n that direction turned by +90 deg.
     """
 
-    x: Array  # of u [1]
-    y: Array
-    root: Array  # P = u.(C - B), made safe where there is none [m]
-    root_squared: Array  # its square as it is: not positive where C is out of reach [m2]
-    across: Array  # h = n.(C - B) [m]
-    position: Array  # rho, of B along its path [m]
-    curvature: Array | None = None  # of the path, towards n [1/m]; None: it is straight
+    x: Num[Array, "links"]  # of u [1]
+    y: Num[Array, "links"]
+    root: Num[Array, "links"]  # P = u.(C - B), made safe where there is none [m]
+    # its square as it is: not positive where C is out of reach [m2]
+    root_squared: Num[Array, "links"]
+    across: Num[Array, "links"]  # h = n.(C - B) [m]
+    position: Num[Array, "links"]  # rho, of B along its path [m]
+    # of the path, towards n [1/m]; None: it is straight
+    curvature: Num[Array, "links"] | None = None
 
     def to_far(self) -> tuple[Array, Array]:
         """C - B in the plane [m]."""

@@ -9,17 +9,17 @@ import numpy as np
 from jaxmodel.lazy import jnp
 from jaxmodel.mechanisms.carriers import Crank, cranks
 from jaxmodel.mechanisms.rrr.cranks import CRANK_PARAMETERS, Cranks, crank_legs
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num, PerLink
 from jaxmodel.table import Parameter
 
 
 class FiveBarGeometry(NamedTuple):
     """Cranks about pivots on the x axis, on either side of O."""
 
-    pivot_distance: Array  # of each pivot from O [m], () or (2,)
-    crank_length: Array  # a [m], () or (2,)
-    elbow: Array  # 1 or -1, see `Cranks`, (2,)
-    zero_angle: Array  # direction of a crank at rho = 0 [rad], (2,)
+    pivot_distance: PerLink  # of each pivot from O [m]
+    crank_length: PerLink  # a [m]
+    elbow: Num[Array, "links"]  # 1 or -1, see `Cranks`
+    zero_angle: Num[Array, "links"]  # direction of a crank at rho = 0 [rad]
 
     def arms(self, xp: Any = jnp) -> None:
         """The links meet in a point."""

@@ -9,7 +9,7 @@ import numpy as np
 from jaxmodel.lazy import jnp
 from jaxmodel.mechanisms.carriers import Rail
 from jaxmodel.mechanisms.contract import SINGULAR_MARGIN, Near, polar, safe_root
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num, PerLink
 
 #: Body angles psi [rad] of the platform joints for the two assemblies that fit the paper's text.
 ASSEMBLIES = {
@@ -19,12 +19,12 @@ ASSEMBLIES = {
 
 
 class Guides(NamedTuple):
-    """Guide i starts at A_i and runs along u_i; s = u.C + s0, h = n.C + h0, (3,) each."""
+    """Guide i starts at A_i and runs along u_i; s = u.C + s0, h = n.C + h0."""
 
-    ux: Array  # direction [1]
-    uy: Array
-    s0: Array  # -u.A [m]
-    h0: Array  # -n.A [m]
+    ux: Num[Array, "links"]  # direction [1]
+    uy: Num[Array, "links"]
+    s0: Num[Array, "links"]  # -u.A [m]
+    h0: Num[Array, "links"]  # -n.A [m]
 
     def side(self, gamma: Array) -> Array:
         """A link along its guide is about to change to the other side of it."""
@@ -58,11 +58,11 @@ class Guides(NamedTuple):
 class GuideGeometry(NamedTuple):
     """Guides and platform joints. The paper's guides are the sides of a triangle around O."""
 
-    guide_side: Array  # a [m], ()
-    guide_angle: Array  # alpha [rad], (3,)
-    joint_radius: Array  # distance platform centre - C_i [m], () or (3,)
-    joint_angle: Array  # psi, body angle of C_i [rad], (3,)
-    guide_offset: Array = 0.0  # how much further from O than the side a guide lies [m], () or (3,)
+    guide_side: Num[Array, ""]  # a [m]
+    guide_angle: Num[Array, "links"]  # alpha [rad]
+    joint_radius: PerLink  # distance platform centre - C_i [m]
+    joint_angle: Num[Array, "links"]  # psi, body angle of C_i [rad]
+    guide_offset: PerLink = 0.0  # how much further from O than the side a guide lies [m]
 
     def arms(self, xp: Any = jnp) -> tuple[Array, Array]:
         """Joints C_i in the platform's axes."""

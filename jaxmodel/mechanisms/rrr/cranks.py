@@ -9,7 +9,7 @@ import numpy as np
 from jaxmodel.lazy import jnp
 from jaxmodel.mechanisms.carriers import Crank, cranks
 from jaxmodel.mechanisms.contract import Near, polar, safe_root
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num, PerLink
 from jaxmodel.table import Parameter
 from jaxmodel.trigonometry import angle_of
 
@@ -18,18 +18,18 @@ TINY_AREA = 1e-20
 
 
 class Cranks(NamedTuple):
-    """Crank i turns about A_i, (n,) each.
+    """Crank i turns about A_i.
 
     The direction of B is that in which rho grows, so that P is positive: against the clock for
     elbows of +1, with it for those of -1.
     """
 
-    x: Array  # of A [m]
-    y: Array
-    length: Array  # a [m]
-    elbow: Array  # 1: C lies to the left of the crank, -1: to its right
-    zero_x: Array  # direction of the crank at rho = 0 [1]
-    zero_y: Array
+    x: Num[Array, "links"]  # of A [m]
+    y: Num[Array, "links"]
+    length: Num[Array, "links"]  # a [m]
+    elbow: Num[Array, "links"]  # 1: C lies to the left of the crank, -1: to its right
+    zero_x: Num[Array, "links"]  # direction of the crank at rho = 0 [1]
+    zero_y: Num[Array, "links"]
 
     def side(self, gamma: Array) -> Array:
         """A link may stand at any angle to the path but across it, in line with the crank."""
@@ -94,13 +94,13 @@ def crank_legs(x: Array, y: Array, length: Array, elbow: Array, zero: Array, xp:
 class CrankGeometry(NamedTuple):
     """Cranks about pivots on a circle around O, and platform joints."""
 
-    pivot_radius: Array  # distance O - A_i [m], () or (n,)
-    pivot_angle: Array  # direction of A_i from O [rad], (n,)
-    crank_length: Array  # a [m], () or (n,)
-    elbow: Array  # 1 or -1, see `Cranks`, () or (n,)
-    zero_angle: Array  # direction of a crank at rho = 0 [rad], (n,)
-    joint_radius: Array  # distance platform centre - C_i [m], () or (n,)
-    joint_angle: Array  # body angle of C_i [rad], (n,)
+    pivot_radius: PerLink  # distance O - A_i [m]
+    pivot_angle: Num[Array, "links"]  # direction of A_i from O [rad]
+    crank_length: PerLink  # a [m]
+    elbow: PerLink  # 1 or -1, see `Cranks`
+    zero_angle: Num[Array, "links"]  # direction of a crank at rho = 0 [rad]
+    joint_radius: PerLink  # distance platform centre - C_i [m]
+    joint_angle: Num[Array, "links"]  # body angle of C_i [rad]
 
     def arms(self, xp: Any = jnp) -> tuple[Array, Array]:
         """Joints C_i in the platform's axes."""
