@@ -80,19 +80,23 @@ class Basis(NamedTuple):
 
 
 def build_basis(
-    kind: str, beam: Beam, patches: Patches, n_modes: int, stations: Array, mode_mask: Array = 1.0
+    kind: str,
+    beam: Beam,
+    patches: Patches,
+    n_modes: int,
+    stations: Num[Array, "S"] | Num[Array, "links S"],
+    mode_mask: Num[Array, ""] | Num[Array, "R"] = 1.0,
 ) -> ModalBasis:
     """Modal basis of all links, usually three.
 
     Args:
         kind: name of one of `BASES` (static).
-        beam: link data, () or (3,) fields.
-        patches: patch data, () or (3,) fields; one row of centres per link.
+        beam: link data.
+        patches: patch data.
         n_modes: R, modes per link (static).
-        stations: where to take the chord deflection [m], (S,), or (3, S) for links with
-            positions of their own.
-        mode_mask: 1 for modes that exist, 0 for modes switched off, () or (R,). A mode that is off
-            keeps its oscillator but couples to nothing, so it stays at rest.
+        stations: where to take the chord deflection [m]; links may have positions of their own.
+        mode_mask: 1 for modes that exist, 0 for modes switched off. A mode that is off keeps
+            its oscillator but couples to nothing, so it stays at rest.
 
     Returns:
         ModalBasis with the true bending stiffness (with `stiffness_factor`).
@@ -184,7 +188,7 @@ def held_frequency(kind: str, beam: Beam, basis: ModalBasis) -> Array:
 
     Args:
         kind: modal basis (static).
-        beam: link data, () or (3,) fields.
+        beam: link data.
         basis: of that kind and beam.
     """
     if BASES[kind].is_on_chord:

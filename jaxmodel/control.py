@@ -10,17 +10,19 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from jaxmodel.lazy import jax, jnp
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Num
 
 
 class PoleGains(NamedTuple):
     """Feedback gains per unit modal mass."""
 
-    position: Array  # k_p [1/s2]
-    velocity: Array  # k_d [1/s]
+    position: Num[Array, "..."]  # k_p [1/s2]
+    velocity: Num[Array, "..."]  # k_d [1/s]
 
 
-def pole_placement(decay: Array, damped_frequency: Array, omega: Array) -> PoleGains:
+def pole_placement(
+    decay: Num[Array, "..."], damped_frequency: Num[Array, "..."], omega: Num[Array, "..."]
+) -> PoleGains:
     """Gains that put a mode's poles at -alpha +- j beta, (22)-(23).
 
     k_d = 2 alpha, k_p = alpha^2 + beta^2 - omega^2.
@@ -36,15 +38,17 @@ def pole_placement(decay: Array, damped_frequency: Array, omega: Array) -> PoleG
     return PoleGains(decay**2 + damped_frequency**2 - omega**2, 2 * decay)
 
 
-def efficient_modal_control(energy: Array, omega: Array) -> Array:
+def efficient_modal_control(
+    energy: Num[Array, "... C"], omega: Num[Array, "... C"]
+) -> Num[Array, "... C"]:
     """EMC ratios k_dj : k_d1 = (E_j/E_1) (omega_1/omega_j), (24).
 
     Args:
-        energy: time mean of the open-loop modal energy [m2/s2], (..., C).
-        omega: modal frequencies [rad/s], (..., C).
+        energy: time mean of the open-loop modal energy [m2/s2].
+        omega: modal frequencies [rad/s].
 
     Returns:
-        (..., C), the first ratio is 1. All ones where mode 1 has no energy.
+        The first ratio is 1. All ones where mode 1 has no energy.
     """
     first = energy[..., :1]
     is_quiet = first <= 0

@@ -190,10 +190,7 @@ def refine_closed_loop_poles(
 
 
 def _improved(
-    response: LoopResponse,
-    function: Callable[[Pair, Pair], Pair],
-    poles: Pair,
-    traced: OrderPoles,
+    response: LoopResponse, function: Callable[[Pair, Pair], Pair], poles: Pair, traced: OrderPoles
 ) -> OrderPoles:
     """One iteration towards zeros of a function with these poles."""
     count, one = len(traced.step), jnp.ones_like(traced.step[0])

@@ -102,29 +102,29 @@ class _Joint(NamedTuple):
 def accelerations(
     plant: Plant,
     chain: Chain,
-    pose_rate: Array,
-    q: Array,
-    q_rate: Array,
-    slider_force: Array,
-    piezo: Array,
-    wrench: Array | None = None,
+    pose_rate: Num[Array, "pose"],
+    q: Num[Array, "links R"],
+    q_rate: Num[Array, "links R"],
+    slider_force: Num[Array, "links"],
+    piezo: Num[Array, "links R"],
+    wrench: Num[Array, "pose"] | None = None,
     is_coupled: bool = True,
-    torque: Array | None = None,
+    torque: Num[Array, "links"] | None = None,
 ) -> Accelerations:
     """Accelerations of pose and modes, (7) solved.
 
     Args:
         plant: the machine.
         chain: closure at this state, from `modal_chain`; without coupling that of straight links.
-        pose_rate: (3,).
-        q: modal coordinates [m], (3, R).
-        q_rate: [m/s], (3, R).
-        slider_force: on the actuated joints [N], (3,).
-        piezo: generalised piezo forces (14) over the modal masses, Q_j/m_j [m/s2], (3, R).
-        wrench: force and moment on the platform at its reference point [N, N, N m], (3,), or None.
+        pose_rate: [m/s, m/s, rad/s].
+        q: modal coordinates [m].
+        q_rate: [m/s].
+        slider_force: on the actuated joints [N].
+        piezo: generalised piezo forces (14) over the modal masses, Q_j/m_j [m/s2].
+        wrench: force and moment on the platform at its reference point [N, N, N m], or None.
         is_coupled: False: kineto-elastodynamics in two passes (static): the machine moves as if its
             links were rigid, motion and axial forces bend the links, and nothing acts back.
-        torque: on the links [N m], (3,), or None.
+        torque: on the links [N m], or None.
 
     Returns:
         Accelerations.
@@ -540,15 +540,21 @@ def inverse_dynamics(
     return jnp.linalg.solve(frame.rho_f * to_f, load)
 
 
-def kinetic_energy(plant: Plant, chain: Chain, pose_rate: Array, q: Array, q_rate: Array) -> Array:
+def kinetic_energy(
+    plant: Plant,
+    chain: Chain,
+    pose_rate: Num[Array, "pose"],
+    q: Num[Array, "links R"],
+    q_rate: Num[Array, "links R"],
+) -> Num[Array, ""]:
     """Kinetic energy (1) [J] in closed form, docs/theory.md.
 
     Args:
         plant: the machine.
         chain: closure at this state.
-        pose_rate: (3,).
-        q: [m], (3, R).
-        q_rate: [m/s], (3, R).
+        pose_rate: [m/s, m/s, rad/s].
+        q: [m].
+        q_rate: [m/s].
     """
     bq, bq_rate = jnp.sum(plant.b * q, axis=1), jnp.sum(plant.b * q_rate, axis=1)
     swing = plant.tip_mass * chain.chord * chain.sine + chain.cosine * bq
@@ -579,6 +585,6 @@ def kinetic_energy(plant: Plant, chain: Chain, pose_rate: Array, q: Array, q_rat
     return jnp.sum(links, axis=0) + platform
 
 
-def potential_energy(plant: Plant, q: Array) -> Array:
+def potential_energy(plant: Plant, q: Num[Array, "links R"]) -> Num[Array, ""]:
     """Bending energy (2) [J]: sum k_j q_j^2/2."""
     return jnp.sum(plant.stiffness * q * q) / 2

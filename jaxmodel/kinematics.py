@@ -96,7 +96,9 @@ class Chain(NamedTuple):
     turning: Num[Array, "links"] | None
 
 
-def close_chain(plant: Plant, pose: Array, pose_rate: Array, bend: Bend | None = None) -> Chain:
+def close_chain(
+    plant: Plant, pose: Num[Array, "pose"], pose_rate: Num[Array, "pose"], bend: Bend | None = None
+) -> Chain:
     """Solve the closure (6) and its rate.
 
     gamma' = (h' - cos(gamma) w' + sin(gamma) d')/P,
@@ -104,8 +106,8 @@ def close_chain(plant: Plant, pose: Array, pose_rate: Array, bend: Bend | None =
 
     Args:
         plant: the machine.
-        pose: (x, y, phi) [m, m, rad], (3,).
-        pose_rate: its rate, (3,).
+        pose: (x, y, phi) [m, m, rad].
+        pose_rate: its rate.
         bend: of the links; None: straight.
 
     Returns:
@@ -246,16 +248,18 @@ def over_poses(plant: Plant, axes: int) -> Plant:
     )
 
 
-def inverse_kinematics(plant: Plant, pose: Array, pose_rate: Array) -> tuple[Array, Array]:
+def inverse_kinematics(
+    plant: Plant, pose: Num[Array, "... pose"], pose_rate: Num[Array, "... pose"]
+) -> tuple[Num[Array, "... links"], Num[Array, "... links"]]:
     """Actuated coordinates [m] and rates [m/s] of the unbent machine for poses on any time axis.
 
     Args:
         plant: the machine.
-        pose: (..., 3) [m, m, rad].
-        pose_rate: (..., 3).
+        pose: [m, m, rad].
+        pose_rate: [m/s, m/s, rad/s].
 
     Returns:
-        (rho, rho_rate), (..., 3) each.
+        (rho, rho_rate).
     """
     lanes = over_poses(plant, pose.ndim - 1)
     chain = close_chain(lanes, jnp.moveaxis(pose, -1, 0), jnp.moveaxis(pose_rate, -1, 0))

@@ -21,7 +21,7 @@ from jaxmodel.dynamics import inverse_dynamics, kinetic_energy, modal_chain
 from jaxmodel.kinematics import close_chain
 from jaxmodel.lazy import compiled, jax, jnp
 from jaxmodel.loop import Loop, PlantState, plant_rates
-from jaxmodel.parameters import Array, Num
+from jaxmodel.parameters import Array, Complex, Num
 
 
 class LinearPlant(NamedTuple):
@@ -79,7 +79,7 @@ def resting(structure: Structure, case: Case) -> Moment | None:
 def linearise(
     structure: Structure,
     loop: Loop,
-    pose: Array,
+    pose: Num[Array, "pose"],
     moment: Moment | None = None,
     is_held: bool = False,
 ) -> LinearPlant:
@@ -88,7 +88,7 @@ def linearise(
     Args:
         structure: static choices.
         loop: constants of the case.
-        pose: (x, y, phi) [m, m, rad], (3,).
+        pose: (x, y, phi) [m, m, rad].
         moment: motion and load there, taken as lasting; None: at rest without load.
         is_held: leave out the feedback of the drives, whose force is held; otherwise a
             sampled drive acts by its `drive_gains`, in continuous time.
@@ -306,17 +306,19 @@ def _scaled(shape: np.ndarray) -> np.ndarray:
     return shape / np.where(peak == 0, 1.0, peak)
 
 
-def frequency_response(plant: LinearPlant, output: Array, source: Array, frequency: Array) -> Array:
+def frequency_response(
+    plant: LinearPlant,
+    output: Num[Array, "p n"],
+    source: Num[Array, "n m"],
+    frequency: Num[Array, "f"],
+) -> Complex[Array, "f p m"]:
     """Response output (j omega - A)^-1 source.
 
     Args:
         plant: linear plant.
-        output: rows over x, (p, n), such as `plant.deflection`.
-        source: columns, (n, m), such as `plant.force`.
-        frequency: [Hz], (f,).
-
-    Returns:
-        complex, (f, p, m).
+        output: rows over x, such as `plant.deflection`.
+        source: columns, such as `plant.force`.
+        frequency: [Hz].
     """
     eye = jnp.eye(plant.state.shape[0])
 

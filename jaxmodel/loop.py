@@ -47,11 +47,9 @@ class Loop(NamedTuple):
     controller: Controller
     # voltage of q' [V s/m] and q [V/m]
     ideal: tuple[Num[Array, "links K R"], Num[Array, "links K R"] | None] | None
-    # controlled modes of the true deflection, modal filter x sensor [1]
-    observer: Num[Array, "links C R"]
+    observer: Num[Array, "links C R"]  # controlled modes of true deflection, filter x sensor [1]
     modal_omega: Num[Array, "links C"]  # frequencies of the controller's modes [rad/s]
-    # of the spectra's phasors per sample
-    rotation: tuple[Num[Array, "links C n_frequencies"], Num[Array, "links C n_frequencies"]]
+    rotation: tuple[Num[Array, "links C F"], Num[Array, "links C F"]]  # of F phasors per sample
     drive: Drive
     axial_compliance: Num[Array, "links"]  # L/(E A) of the links [m/N]
     left_out: LeftOut | None  # static response of the modes left out; None: truncated model
@@ -59,8 +57,7 @@ class Loop(NamedTuple):
     delayed: Delayed | None = None  # None: commands are held from sample to sample, one later
     hysteresis: Hysteresis | None = None  # of the actuators; None: they are linear
     rest: Rest | None = None  # about which the linear model is taken; None: the full model
-    # omega^2 [1/s2] and decay [1/s] of the elongations' oscillators in `exponential`, less those of
-    # links alone; None: links keep their length
+    # elongations' omega^2 [1/s2] and decay [1/s] in `exponential`, less the links' own; None: none
     split: tuple[Num[Array, "links"], Num[Array, "links"]] | None = None
     strain: tuple[Array, Array] | None = None  # `Sample.strain` of q [1/m] and of voltages [1/V]
 
@@ -120,8 +117,7 @@ class PlantState(NamedTuple):
     direct_z: Num[Array, "links K"] | None = None  # anti-alias filtered [V]
     direct_z_rate: Num[Array, "links K"] | None = None  # [V/s]
     direct_s: Num[Array, "links K"] | None = None  # drained by the amplifiers' inputs [V]
-    # on their way, u_(k-2), u_(k-3), .. [V]
-    commands: Num[Array, "waiting links K"] | None = None
+    commands: Num[Array, "waiting links K"] | None = None  # on their way, u_(k-2), u_(k-3), .. [V]
     plays: Num[Array, "N links K"] | None = None  # of the actuators' hysteresis [V]
     motor: Num[Array, "links n"] | None = None  # of motors that follow late, see `drive.LAG` [N]
 

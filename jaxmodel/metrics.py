@@ -56,8 +56,8 @@ class Fixed(NamedTuple):
 
     omega: Num[Array, "links R"]  # plant modes [rad/s]
     modal_omega: Num[Array, "links C"]  # controller's modes [rad/s]
-    # cos and sin of (frequency x period)
-    rotation: tuple[Num[Array, "links C n_frequencies"], Num[Array, "links C n_frequencies"]]
+    # cos and sin of (frequency x period), F frequencies
+    rotation: tuple[Num[Array, "links C F"], Num[Array, "links C F"]]
     band: Num[Array, ""]  # settling band [m]
 
 

@@ -119,12 +119,7 @@ def _resting(path: Path, shape: tuple[int, ...]) -> PathSample:
 
 
 def shape_path(
-    path: Path,
-    taps: Taps,
-    n_times: int,
-    per_sample: int,
-    step: Array,
-    within: Array | None = None,
+    path: Path, taps: Taps, n_times: int, per_sample: int, step: Array, within: Array | None = None
 ) -> PathSample:
     """Return the path convolved with a sampled input shaper, on the grid t_j = j h.
 

@@ -1,9 +1,9 @@
 """The numbers that one evaluation of the dynamics reads, computed once per case.
 
 Layout used by every per-step function: structure first, lanes last. Pose arrays have shape (pose,),
-link arrays (links,), mode arrays (links, R); any further trailing axes are lanes of a batch. Link arrays
-meet mode arrays as `x[:, None]`, sums run over axis 1 (modes) and axis 0 (links), so the same code
-runs on one case, under `vmap`, and on lanes in the last axis.
+link arrays (links,), mode arrays (links, R); any further trailing axes are lanes of a batch. Link
+arrays meet mode arrays as `x[:, None]`, sums run over axis 1 (modes) and axis 0 (links), so the
+same code runs on one case, under `vmap`, and on lanes in the last axis.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import NamedTuple
 from jaxmodel.beam import ModalBasis
 from jaxmodel.lazy import jnp
 from jaxmodel.mechanisms.contract import Legs
-from jaxmodel.parameters import Array, Damping, Machine, Num
+from jaxmodel.parameters import Array, Damping, Machine, Num, Shaped
 from jaxmodel.stretch import Stretch
 
 
@@ -67,7 +67,7 @@ LOCK_MASS = 1e9
 def build_plant(
     machine: Machine,
     basis: ModalBasis,
-    is_locked: Array = False,
+    is_locked: Shaped[Array, ""] = False,
     has_shortening: bool = True,
     is_distributed: bool = False,
     stretch: Stretch | None = None,

@@ -317,11 +317,7 @@ def evaluate_loop_gain(
     pose = s * s * response.mass + s * response.damping + response.stiffness - links
     whole = determinant(pose)
     return LoopGain(
-        own=own,
-        joint=joint,
-        pose=pose,
-        pose_inverse=whole.inverse(),
-        assembled=whole * stiff,
+        own=own, joint=joint, pose=pose, pose_inverse=whole.inverse(), assembled=whole * stiff
     )
 
 

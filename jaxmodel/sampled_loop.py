@@ -61,7 +61,7 @@ class LoopMatrices(NamedTuple):
 def closed_loop(
     structure: Structure,
     case: Case,
-    pose: Array,
+    pose: Num[Array, "pose"],
     law: Controller | None = None,
     moment: Moment | None = None,
 ) -> LoopMatrices:
@@ -70,7 +70,7 @@ def closed_loop(
     Args:
         structure: static choices with feedback "sampled".
         case: the numbers; its gains belong to factor 1.
-        pose: where to linearise [m, m, rad], (3,).
+        pose: where to linearise [m, m, rad].
         law: controller to judge instead of the case's own, for instance with rounded coefficients.
         moment: motion and load at that pose; None: at rest under the case's steady load.
 

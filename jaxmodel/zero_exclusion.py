@@ -14,14 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxmodel.discs import (
-    Disc,
-    interval,
-    inverse_of,
-    largest_over,
-    maxima_over_slices,
-    phase,
-)
+from jaxmodel.discs import Disc, interval, inverse_of, largest_over, maxima_over_slices, phase
 from jaxmodel.modal_loop import LawPoles, ModalLoop, law_poles, law_response
 from jaxmodel.mode_tail import Tail, bound_tail, least_denominator, pose_scale, static_rest
 from jaxmodel.parameters import Array, Num

@@ -16,7 +16,5 @@ from jaxmodel.drives.super_twisting import SUPER_TWISTING
 from jaxmodel.table import Table
 
 DRIVES: Table[DriveLaw] = Table(
-    "drive",
-    [PD, COMPUTED_TORQUE, DISTURBANCE_OBSERVER, SLIDING_MODE, SUPER_TWISTING],
-    check_drive,
+    "drive", [PD, COMPUTED_TORQUE, DISTURBANCE_OBSERVER, SLIDING_MODE, SUPER_TWISTING], check_drive
 )

@@ -5,12 +5,7 @@ from __future__ import annotations
 from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.control import PoleGains
-from jaxmodel.laws.contract import (
-    Law,
-    NominalModel,
-    acting_channels,
-    modal_feedback,
-)
+from jaxmodel.laws.contract import Law, NominalModel, acting_channels, modal_feedback
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 from jaxmodel.table import Parameter

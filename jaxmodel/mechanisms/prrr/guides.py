@@ -37,12 +37,7 @@ class Guides(NamedTuple):
         root_squared = squared - h * h
         root = safe_root(root_squared, floor, xp)
         return Near(
-            x=self.ux,
-            y=self.uy,
-            root=root,
-            root_squared=root_squared,
-            across=h,
-            position=s - root,
+            x=self.ux, y=self.uy, root=root, root_squared=root_squared, across=h, position=s - root
         )
 
     def misplaced(self, x: np.ndarray, y: np.ndarray, length: np.ndarray) -> list[str]:
