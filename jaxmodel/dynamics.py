@@ -20,8 +20,8 @@ class Accelerations(NamedTuple):
     """Result of one evaluation of the dynamics."""
 
     pose: Num[Array, "pose"]  # X'' [m/s2, m/s2, rad/s2]
-    modal: Num[Array, "links R"]  # q'' [m/s2]
-    coupling: Num[Array, "links R"]  # q'' + (k q + d q')/m: all except the oscillator itself [m/s2]
+    modal: Num[Array, "links Q"]  # q'' [m/s2]
+    coupling: Num[Array, "links Q"]  # q'' + (k q + d q')/m: all except the oscillator itself [m/s2]
     rho: Num[Array, "links"]  # rho'' [m/s2]
     beta: Num[Array, "links"]  # beta'' of the links in the plane [rad/s2]
     axial: Num[Array, "links"]  # N, tension in the link that acts on its bending [N]
@@ -103,10 +103,10 @@ def accelerations(
     plant: Plant,
     chain: Chain,
     pose_rate: Num[Array, "pose"],
-    q: Num[Array, "links R"],
-    q_rate: Num[Array, "links R"],
+    q: Num[Array, "links Q"],
+    q_rate: Num[Array, "links Q"],
     slider_force: Num[Array, "links"],
-    piezo: Num[Array, "links R"],
+    piezo: Num[Array, "links Q"],
     wrench: Num[Array, "pose"] | None = None,
     is_coupled: bool = True,
     torque: Num[Array, "links"] | None = None,
@@ -259,8 +259,8 @@ def _link(
 class _Spread(NamedTuple):
     """What distributed axial inertia adds to the lumped one, per modal coordinate."""
 
-    inward: Num[Array, "links R"]  # p = (P - mu S) q, momentum along the chord [kg]
-    turning: Num[Array, "links R"]  # Q q, taken from the moment of inertia [kg m]
+    inward: Num[Array, "links Q"]  # p = (P - mu S) q, momentum along the chord [kg]
+    turning: Num[Array, "links Q"]  # Q q, taken from the moment of inertia [kg m]
 
 
 def _spread(plant: Plant, q: Array) -> _Spread | None:
@@ -322,7 +322,7 @@ def _joint(chain: Chain, link: _Link) -> _Joint:
 class _End(NamedTuple):
     """Interaction of the modes with the far joint of a link."""
 
-    row: Num[Array, "links R"]  # motion of C along f per modal coordinate, sign reversed [1]
+    row: Num[Array, "links Q"]  # motion of C along f per modal coordinate, sign reversed [1]
     # C'' along f that slider and link feel: -motion[0] + motion[1] C''_f + motion[2] C''_g
     motion: tuple[Array, Array, Array]
     # reaction on row_j of every mode [N]: force[0] + force[1] C''_f + force[2] C''_g
@@ -544,8 +544,8 @@ def kinetic_energy(
     plant: Plant,
     chain: Chain,
     pose_rate: Num[Array, "pose"],
-    q: Num[Array, "links R"],
-    q_rate: Num[Array, "links R"],
+    q: Num[Array, "links Q"],
+    q_rate: Num[Array, "links Q"],
 ) -> Num[Array, ""]:
     """Kinetic energy (1) [J] in closed form, docs/theory.md.
 
@@ -585,6 +585,6 @@ def kinetic_energy(
     return jnp.sum(links, axis=0) + platform
 
 
-def potential_energy(plant: Plant, q: Num[Array, "links R"]) -> Num[Array, ""]:
+def potential_energy(plant: Plant, q: Num[Array, "links Q"]) -> Num[Array, ""]:
     """Bending energy (2) [J]: sum k_j q_j^2/2."""
     return jnp.sum(plant.stiffness * q * q) / 2

@@ -26,10 +26,10 @@ _TERMS = 10
 class Exponential(NamedTuple):
     """Coefficients of one step of length h; n rows and columns (q, q', z, z'; s if drained)."""
 
-    half: Num[Array, "2 2 links R"]  # exp(A h/2), upper left block
-    half_force: Num[Array, "2 links R"]  # h/2 phi_1(A h/2) times the force direction
-    full: Num[Array, "n n links R"]  # exp(A h)
-    full_force: Num[Array, "3 n links R"]  # ETDRK4 weights of N(u), N(a) + N(b), N(c)
+    half: Num[Array, "2 2 links Q"]  # exp(A h/2), upper left block
+    half_force: Num[Array, "2 links Q"]  # h/2 phi_1(A h/2) times the force direction
+    full: Num[Array, "n n links Q"]  # exp(A h)
+    full_force: Num[Array, "3 n links Q"]  # ETDRK4 weights of N(u), N(a) + N(b), N(c)
 
 
 def exponential_step(

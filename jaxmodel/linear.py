@@ -30,7 +30,7 @@ class LinearPlant(NamedTuple):
     States of motors that follow late come last in x.
     """
 
-    state: Num[Array, "n n"]  # A [1/s and mixed], n = 6 + 6 (coordinates of a link)
+    state: Num[Array, "n n"]  # A [1/s and mixed], n = 2 (pose + links Q)
     voltage: Num[Array, "n links*K"]  # B_voltage
     force: Num[Array, "n links"]  # B_force, disturbance on the actuated joints
     deflection: Num[Array, "links*S n"]  # chord deflection at the stations [m]

@@ -41,13 +41,13 @@ class Loop(NamedTuple):
     exponential: Exponential
     plant_step: Num[Array, ""]  # length of one plant step [s]
     amplifier: Amplifier | None  # None: commands are on the actuators at once
-    sensor: Num[Array, "links K R"]  # V_s of a modal coordinate, lambda_s Phi_s^t [V/m]
-    actuator: Num[Array, "links R K"]  # modal acceleration of a voltage, lambda_a Phi_a/m [m/s2/V]
-    deflection_at: Num[Array, "links S R"]  # chord deflection at the stations [1]
+    sensor: Num[Array, "links K Q"]  # V_s of a modal coordinate, lambda_s Phi_s^t [V/m]
+    actuator: Num[Array, "links Q K"]  # modal acceleration of a voltage, lambda_a Phi_a/m [m/s2/V]
+    deflection_at: Num[Array, "links S Q"]  # chord deflection at the stations [1]
     controller: Controller
     # voltage of q' [V s/m] and q [V/m]
-    ideal: tuple[Num[Array, "links K R"], Num[Array, "links K R"] | None] | None
-    observer: Num[Array, "links C R"]  # controlled modes of true deflection, filter x sensor [1]
+    ideal: tuple[Num[Array, "links K Q"], Num[Array, "links K Q"] | None] | None
+    observer: Num[Array, "links C Q"]  # controlled modes of true deflection, filter x sensor [1]
     modal_omega: Num[Array, "links C"]  # frequencies of the controller's modes [rad/s]
     rotation: tuple[Num[Array, "links C F"], Num[Array, "links C F"]]  # of F phasors per sample
     drive: Drive
@@ -107,11 +107,11 @@ class PlantState(NamedTuple):
 
     pose: Num[Array, "pose"]  # [m, m, rad]
     pose_rate: Num[Array, "pose"]
-    q: Num[Array, "links R"]  # [m]
-    q_rate: Num[Array, "links R"]  # [m/s]
-    z: Num[Array, "links R"] | None = None  # anti-alias filtered q - s [m]
-    z_rate: Num[Array, "links R"] | None = None  # [m/s]
-    s: Num[Array, "links R"] | None = None  # slow part of q, which the amplifiers' inputs drain [m]
+    q: Num[Array, "links Q"]  # [m]
+    q_rate: Num[Array, "links Q"]  # [m/s]
+    z: Num[Array, "links Q"] | None = None  # anti-alias filtered q - s [m]
+    z_rate: Num[Array, "links Q"] | None = None  # [m/s]
+    s: Num[Array, "links Q"] | None = None  # slow part of q, which the amplifiers' inputs drain [m]
     voltage: Num[Array, "links K"] | None = None  # on the actuators, behind their amplifiers [V]
     # the actuators' voltages as modes that are left out show them to the sensors
     direct_z: Num[Array, "links K"] | None = None  # anti-alias filtered [V]

@@ -4,8 +4,8 @@ Nothing here is derived and nothing is static, so `jax.vmap`, `jax.grad` and `ja
 field. `paper_machine()` is the machine of the paper.
 
 The package writes axes of arrays as jaxtyping does: `links` flexible links, `pose` coordinates of
-the platform, R plant modes and C controlled modes of a link, K patches and S stations on it; other
-letters are explained where they stand.
+the platform; R plant modes, C controlled modes and Q coordinates of a link, its modes and, if it
+lengthens, its elongation; K patches and S stations on it. Other letters belong to one class.
 """
 
 from __future__ import annotations

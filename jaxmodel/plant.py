@@ -1,7 +1,7 @@
 """The numbers that one evaluation of the dynamics reads, computed once per case.
 
 Layout used by every per-step function: structure first, lanes last. Pose arrays have shape (pose,),
-link arrays (links,), mode arrays (links, R); any further trailing axes are lanes of a batch. Link
+link arrays (links,), mode arrays (links, Q); any further trailing axes are lanes of a batch. Link
 arrays meet mode arrays as `x[:, None]`, sums run over axis 1 (modes) and axis 0 (links), so the
 same code runs on one case, under `vmap`, and on lanes in the last axis.
 """
@@ -34,21 +34,21 @@ class Plant(NamedTuple):
     platform_moment: Num[Array, "2"] | None  # mass times its centre in the platform's axes [kg m]
     # modes
     modal_mass: Num[Array, "links"]  # m, the same for all modes of a link [kg]
-    stiffness: Num[Array, "links R"]  # k_j [N/m]
-    damping: Num[Array, "links R"]  # d_j = 2 zeta sqrt(k m) [N s/m]
-    tip: Num[Array, "links R"] | None  # Y_j(L) [1], None where zero
+    stiffness: Num[Array, "links Q"]  # k_j [N/m]
+    damping: Num[Array, "links Q"]  # d_j = 2 zeta sqrt(k m) [N s/m]
+    tip: Num[Array, "links Q"] | None  # Y_j(L) [1], None where zero
     shortening: Num[Array, "links R"] | None  # S_jj [1/m], None where the chord keeps its length
     # S_jk, zero for j = k [1/m], None where all zero
     mixed_shortening: Num[Array, "links R R"] | None
-    inward: Num[Array, "links R R"] | None  # P_jk - mu S_jk [kg/m], None where lumped at the joints
-    centrifugal: Num[Array, "links R R"] | None  # Q_jk [kg], None likewise
-    b: Num[Array, "links R"]  # [kg]
-    c: Num[Array, "links R"]  # [kg m]
+    inward: Num[Array, "links Q Q"] | None  # P_jk - mu S_jk [kg/m], None where lumped at the joints
+    centrifugal: Num[Array, "links Q Q"] | None  # Q_jk [kg], None likewise
+    b: Num[Array, "links Q"]  # [kg]
+    c: Num[Array, "links Q"]  # [kg m]
     # elongation of a link per last coordinate, which is no mode [1]; None: no such one
     stretch: Num[Array, "links"] | None = None
     # of joints that rub: T [N m] and speed of its tanh [rad/s], slopes of the coordinates
     # at the near and the far end [1/m]; None: they do not
-    joint_friction: tuple[Num[Array, ""] | Num[Array, "links R"], ...] | None = None
+    joint_friction: tuple[Num[Array, ""] | Num[Array, "links Q"], ...] | None = None
 
 
 def damping_ratio(damping: Damping, omega: Array) -> Array:

@@ -58,7 +58,7 @@ class Prepared(NamedTuple):
     loop: Loop
     bases: Bases  # the modal bases it is built from
     taps: shaper.Taps  # shaper on the sample grid
-    initial_q: Num[Array, "links R"]  # [m]
+    initial_q: Num[Array, "links Q"]  # [m]
     sensor_condition: Num[Array, "links"]  # condition number of the modal filter per link [1]
     actuator_condition: Num[Array, "links"]  # of the synthesizer [1]
     status: Num[Array, ""]  # fault found before the run, as a float
