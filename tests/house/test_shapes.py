@@ -60,8 +60,10 @@ FULL = {
 NAMES = {name: getattr(jaxtyping, name) for name in ("Complex", "Int", "Num", "Shaped")}
 NAMES["Array"] = np.ndarray
 NAMES["PerLink"] = reduce(or_, (Num[np.ndarray, x.__metadata__[0]] for x in get_args(PerLink)))
-#: An array or no field, and a comment that ends in a shape or goes on after one: "[m], (3, C); ..".
-_FIELD = re.compile(r"^ +(\w+: .*\bArray\b.*)?# .*[\],;] \(([\w +]+,[\w +,]*)?\)")
+#: A line with an array or no field, whose comment has a shape: "[m], (3, C); None: ..".
+_FIELD = re.compile(
+    r"^ +(\w+: .*\bArray\b.*)?# (.*[\],;\w] )?\(([\w +]+,[\w +,.]*)?\)( each)?(, None.*)?($|[;:])"
+)
 
 
 class Right(NamedTuple):
@@ -129,8 +131,7 @@ def traced(study: Study) -> dict[str, Any]:
             start = begin(structure, case)
         start = start._replace(inputs=jax.tree.map(lambda x: x[0], start.inputs))
         end, record = step(structure, loop, start.state, start.inputs)
-        response = loop_response(structure, case, loop, pose)
-        return {
+        parts = {
             "case": case,
             "prepared": prepared,
             "impulses": zvd(loop.omega[0, 0], 0.0),
@@ -138,6 +139,11 @@ def traced(study: Study) -> dict[str, Any]:
             "end": end,
             "record": record,
             "result": conclude(start.outline, end.status, end),
+        }
+        if structure.n_links == 2:
+            return parts
+        response = loop_response(structure, case, loop, pose)
+        return parts | {
             "response": response,
             "modes": assembled_modes(response),
             "plant response": plant_response(structure, case, loop, pose),
