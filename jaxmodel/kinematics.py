@@ -17,7 +17,7 @@ import numpy as np
 from jaxmodel import status
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.mechanisms.contract import SINGULAR_MARGIN, Near
-from jaxmodel.parameters import Array, Num
+from jaxmodel.parameters import Array, Num, PerLink
 from jaxmodel.plant import Plant
 from jaxmodel.trigonometry import sine_cosine
 
@@ -85,7 +85,7 @@ class Chain(NamedTuple):
     cx: Num[Array, "links"] | None  # C - X in the plane [m]
     cy: Num[Array, "links"] | None
     near: Near  # joints B
-    far: tuple[Num[Array, "links"], Num[Array, "links"]]  # joints C in the plane [m]
+    far: tuple[PerLink, PerLink]  # joints C in the plane [m]
     chord: Num[Array, "links"]  # c [m]
     sine: Num[Array, "links"]  # sin gamma [1]
     cosine: Num[Array, "links"]  # cos gamma [1]

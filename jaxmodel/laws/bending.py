@@ -33,7 +33,7 @@ BENDING = Parameter(
 
 
 class BentModel(NamedTuple):
-    """A link model with the slow modal forces as last states, leading axis 3."""
+    """A link model with the slow modal forces as last states, leading axis `links`."""
 
     model: LinkModel  # of n + C states
     compliance: Num[Array, "links n C"]  # X, state about which the link vibrates per modal force
@@ -54,7 +54,7 @@ def bent(case: Case, model: LinkModel) -> BentModel:
 
     Args:
         case: the numbers.
-        model: leading axis 3.
+        model: leading axis `links`.
 
     Returns:
         BentModel; X = (I - F)^-1 W, at rest under a force that stays.

@@ -41,7 +41,7 @@ class LinkModel(NamedTuple):
 
 
 def link_model(structure: Structure, case: Case, nominal: NominalModel) -> LinkModel:
-    """The model of each link; leading axis 3.
+    """The model of each link; leading axis `links`.
 
     Args:
         structure: static choices; electronics that exist are part of the model.
@@ -166,7 +166,7 @@ def _first_command(at: dict[str, slice]) -> int:
 class _Moves(NamedTuple):
     """A link over a sample."""
 
-    whole: Num[Array, "n n+K+C"]  # with everything held
+    whole: Num[Array, "m m+K+C"]  # with everything held, of m states without commands
     state: Num[Array, "n n"]  # with the commands that it has, see `LinkModel`
     enter: Num[Array, "n K"]
     met: Num[Array, "n n"]
@@ -238,7 +238,7 @@ def compensated(
 
     Args:
         structure, case: of the law.
-        model: of each link, leading axis 3.
+        model: of each link, leading axis `links`.
         gain: K, (3, K, n).
         correct: M of x + M (y - C x), (3, n, K).
     """

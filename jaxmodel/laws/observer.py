@@ -88,7 +88,7 @@ def regulator(structure: Structure, case: Case, nominal: NominalModel, model: Li
 
     Args:
         structure, case, nominal: of the law.
-        model: of each link, leading axis 3.
+        model: of each link, leading axis `links`.
     """
     period = case.electronics.period
     damping, square = closed_modes(structure, case, nominal)
