@@ -239,9 +239,10 @@ def mass_and_stiffness(loop: Loop, pose: Array, plant: LinearPlant) -> tuple[Arr
 class NaturalModes(NamedTuple):
     """Natural modes, ascending in frequency."""
 
-    frequency: np.ndarray  # |lambda|/2 pi [Hz], (m,)
-    damping_ratio: np.ndarray  # [1], (m,)
-    shape: np.ndarray  # (X, q) part of the eigenvectors, largest entry 1, (m, m), one per column
+    frequency: Num[np.ndarray, "m"]  # |lambda|/2 pi [Hz]
+    damping_ratio: Num[np.ndarray, "m"]  # [1]
+    # (X, q) part of the eigenvectors, largest entry 1, one per column
+    shape: Num[np.ndarray, "m m"]
 
 
 def natural_modes(plant: LinearPlant) -> NaturalModes:

@@ -271,13 +271,21 @@ def filled(page: str) -> str:
 
 
 def members_text(source: str) -> dict[str, str]:
-    """What the comments beside the members of a class say, by name.
+    """What comments say about the members of a class, beside or above them, with axes by name.
 
     Args:
-        source: of the class, whose members stand one a line: `mass: Array  # of a slider [kg]`.
+        source: of the class, whose members stand one a line:
+            `mass: Num[Array, "links"]  # of a slider [kg]`.
     """
-    member = r"^    (\w+): [^#\n]+(?:  # (.+))?$"
-    return {name: text for name, text in re.findall(member, source, re.MULTILINE) if text}
+    member = r"((?:^    # .+\n)*)^    (\w+): ([^#\n]+)(?:  # (.+))?$"
+    found = {}
+    for above, name, annotation, beside in re.findall(member, source, re.MULTILINE):
+        text = beside or " ".join(line.strip("# ") for line in above.splitlines())
+        shapes = dict.fromkeys(re.findall(r'\[(?:Array|np.ndarray), "(.*?)"\]', annotation))
+        axes = " or ".join(f"({', '.join(shape.split())})" for shape in shapes)
+        if parts := [x for x in (text, axes) if x]:
+            found[name] = ", ".join(parts)
+    return found
 
 
 if __name__ == "__main__":

@@ -94,11 +94,13 @@ def test_the_reference_is_current(name):
     assert text == reference.filled(text), "run: make reference"
 
 
-def test_members_are_read_from_the_comments_beside_them():
+def test_members_are_read_from_their_comments_and_annotations():
     source = (
-        "class A(NamedTuple):\n    mass: Array  # [kg], (3,)\n    other: int\n    k: int = 1  # x\n"
+        'class A(NamedTuple):\n    mass: Num[Array, "n C"] | None  # [kg]\n    other: int\n'
+        '    # l [m]\n    length: Num[Array, ""] = 0.0\n    k: int = 1  # x\n'
     )
-    assert reference.members_text(source) == {"mass": "[kg], (3,)", "k": "x"}
+    found = reference.members_text(source)
+    assert found == {"mass": "[kg], (n, C)", "length": "l [m], ()", "k": "x"}
 
 
 # links
