@@ -2,7 +2,7 @@ from .bases import find_bases
 from .beam import BASES, build_basis
 from .case import Case, Structure
 from .control import efficient_modal_control, pole_placement
-from .defaults import paper_case, with_values
+from .defaults import paper_case
 from .dynamics import accelerations, kinetic_energy, potential_energy
 from .equations import equations_of_motion, lumped_forces
 from .judge import judge
@@ -14,6 +14,7 @@ from .parameters import Machine
 from .plant import build_plant
 from .prepare import prepare
 from .sampled_loop import closed_loop
+from .shaper import ei, residual_vibration
 from .simulate import RunResult, command, simulate
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "closed_loop",
     "command",
     "efficient_modal_control",
+    "ei",
     "equations_of_motion",
     "find_bases",
     "frequency_response",
@@ -44,7 +46,7 @@ __all__ = [
     "pole_placement",
     "potential_energy",
     "prepare",
+    "residual_vibration",
     "simulate",
     "step",
-    "with_values",
 ]

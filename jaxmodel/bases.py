@@ -30,6 +30,10 @@ def find_bases(structure: Structure, case: Case) -> Bases:
     Args:
         structure: static choices; bases and sizes are read.
         case: the numbers.
+
+    Example:
+        >>> find_bases(*paper_case({"link.modes": 2})).plant_omega.shape
+        (3, 3)
     """
     beam, patches, n = case.machine.beam, case.machine.patches, structure.n_controlled
     belief, factor = beam._replace(stiffness_factor=1.0), beam.stiffness_factor

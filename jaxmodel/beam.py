@@ -103,6 +103,12 @@ def build_basis(
 
     Raises:
         ValueError: unknown kind, or no modes.
+
+    Example:
+        >>> machine = paper_machine()
+        >>> basis = build_basis("loaded", machine.beam, machine.patches, 3, jnp.full((3, 1), 0.1))
+        >>> jnp.sqrt(basis.stiffness / basis.mass).shape
+        (3, 3)
     """
     if kind not in BASES:
         raise ValueError(f"basis = {kind!r}; allowed: {', '.join(BASES)}")

@@ -34,6 +34,11 @@ def pole_placement(
 
     Returns:
         PoleGains per unit modal mass; times m_j they are in N/m and N s/m.
+
+    Example:
+        >>> gains = pole_placement(20.0, 700.0, 700.0)
+        >>> gains.velocity, gains.position
+        (40.0, 400.0)
     """
     return PoleGains(decay**2 + damped_frequency**2 - omega**2, 2 * decay)
 
@@ -49,6 +54,11 @@ def efficient_modal_control(
 
     Returns:
         The first ratio is 1. All ones where mode 1 has no energy.
+
+    Example:
+        >>> energy, omega = jnp.array([4.0, 1.0]), jnp.array([700.0, 2800.0])
+        >>> efficient_modal_control(energy, omega).tolist()
+        [1.0, 0.0625]
     """
     first = energy[..., :1]
     is_quiet = first <= 0

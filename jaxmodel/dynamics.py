@@ -128,6 +128,14 @@ def accelerations(
 
     Returns:
         Accelerations.
+
+    Example:
+        >>> plant = prepare(*paper_case({"link.modes": 2})).loop.plant
+        >>> pose, zero, q = jnp.array(HOME), jnp.zeros(3), jnp.zeros((3, 3))
+        >>> force = jnp.array([1.0, 0.0, 0.0])
+        >>> chain = close_chain(plant, pose, zero)
+        >>> accelerations(plant, chain, zero, q, q, force, q).pose.shape
+        (3,)
     """
     swing = _swing(plant, chain, q_rate)
     # modal accelerations without inertia: of piezos and rotation, and of the oscillator itself
@@ -555,6 +563,13 @@ def kinetic_energy(
         pose_rate: [m/s, m/s, rad/s].
         q: [m].
         q_rate: [m/s].
+
+    Example:
+        >>> plant = prepare(*paper_case({"link.modes": 2})).loop.plant
+        >>> rate, q = jnp.array([0.1, 0.0, 0.0]), jnp.zeros((3, 3))
+        >>> chain = close_chain(plant, jnp.array(HOME), rate)
+        >>> f"{kinetic_energy(plant, chain, rate, q, q):.2e} J"
+        '3.36e-03 J'
     """
     bq, bq_rate = jnp.sum(plant.b * q, axis=1), jnp.sum(plant.b * q_rate, axis=1)
     swing = plant.tip_mass * chain.chord * chain.sine + chain.cosine * bq
@@ -586,5 +601,11 @@ def kinetic_energy(
 
 
 def potential_energy(plant: Plant, q: Num[Array, "links Q"]) -> Num[Array, ""]:
-    """Bending energy (2) [J]: sum k_j q_j^2/2."""
+    """Bending energy (2) [J]: sum k_j q_j^2/2.
+
+    Example:
+        >>> plant = prepare(*paper_case({"link.modes": 2})).loop.plant
+        >>> f"{potential_energy(plant, 1e-5 * jnp.eye(3)):.2e} J"
+        '5.67e-04 J'
+    """
     return jnp.sum(plant.stiffness * q * q) / 2

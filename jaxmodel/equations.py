@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from jaxmodel.case import Case, Structure
@@ -17,24 +15,14 @@ from jaxmodel.plant import Plant
 from jaxmodel.prepare import prepare
 
 
-class Equations(NamedTuple):
-    """M x'' + C x' + K x = F f + V v: small motions x = (X, q) about rest at a pose, (7).
-
-    q of all links, one after the other; f on the actuated joints [N], v on the actuators [V].
-    """
-
-    mass: Array  # M [kg and mixed], (n, n)
-    damping: Array  # C [N s/m and mixed], (n, n)
-    stiffness: Array  # K [N/m and mixed], (n, n)
-    force: Array  # F [1 and m], (n, l)
-    voltage: Array  # V [N/V and N m/V], (n, l K)
-
-
 @compiled("structure", "has_drive")
 def equations_of_motion(
     structure: Structure, case: Case, pose: Array, has_drive: bool = False
-) -> Equations:
-    """Matrices of (7) about rest at a pose.
+) -> tuple[Array, Array, Array, Array, Array]:
+    """M, C, K, F, V of (7): M x'' + C x' + K x = F f + V v, small motions about rest at a pose.
+
+    x = (X, q), the coordinates of all links one after the other; f on the actuated joints [N], v on
+    the actuators [V].
 
     Args:
         structure: static choices; its feedback is left out.
@@ -43,12 +31,13 @@ def equations_of_motion(
         has_drive: with stiffness and damping of the drives' own loops (static).
 
     Returns:
-        Equations.
+        M [kg and mixed], C [N s/m and mixed], K [N/m and mixed], (n, n) each, F [1 and m], (n, l),
+        V [N/V and N m/V], (n, l K).
 
     Example:
-        >>> structure, case = paper_case(n_modes=2)
-        >>> equations_of_motion(structure, case, HOME).mass.shape
-        (12, 12)
+        >>> M, C, K, F, V = equations_of_motion(*paper_case({"link.modes": 2}), HOME)
+        >>> M.shape, V.shape
+        ((12, 12), (12, 9))
     """
     check_shape("pose", pose, (structure.n_pose,))
     free = structure._replace(feedback="none")
@@ -57,20 +46,8 @@ def equations_of_motion(
     plant = linearise(free, loop, pose, is_held=not has_drive)
     mass, stiffness = mass_and_stiffness(loop, pose, plant)
     _, rates = places_and_rates(plant)
-    return Equations(
-        mass=mass,
-        damping=-mass @ plant.state[np.ix_(rates, rates)],
-        stiffness=stiffness,
-        force=mass @ plant.force[rates],
-        voltage=mass @ plant.voltage[rates],
-    )
-
-
-class LumpedForces(NamedTuple):
-    """What rigid and elastic motion do to each other: (8) and (9) have it on the right."""
-
-    platform: Array  # T_d on the rigid motion [N, N, N m], (3,)
-    modes: Array  # t_d on the modes [N], (3, R)
+    damping = -mass @ plant.state[np.ix_(rates, rates)]
+    return mass, damping, stiffness, mass @ plant.force[rates], mass @ plant.voltage[rates]
 
 
 @compiled()
@@ -82,8 +59,8 @@ def lumped_forces(
     q_rate: Array,
     slider_force: Array,
     modal_force: Array,
-) -> LumpedForces:
-    """Lumped disturbances of (8) and (9) at a state of the nonlinear machine.
+) -> tuple[Array, Array]:
+    """T_d and t_d, the lumped disturbances of (8) and (9), at a state of the nonlinear machine.
 
     t_d = M_ff q'' + K_f q - F_PZT, and T_d = J_p^T (F_0 - F_a), where F_0 would give the machine
     with straight links the same motion of its platform.
@@ -96,13 +73,13 @@ def lumped_forces(
         modal_force: F_PZT [N], (3, R).
 
     Returns:
-        LumpedForces.
+        T_d on the rigid motion [N, N, N m], (3,); t_d on the modes [N], (3, R).
 
     Example:
-        >>> plant = prepare(*paper_case(n_modes=2)).loop.plant
+        >>> plant = prepare(*paper_case({"link.modes": 2})).loop.plant
         >>> still = jnp.zeros(3), jnp.zeros((3, 3))
         >>> bent = 1e-5 * jnp.ones((3, 3))
-        >>> lumped_forces(plant, jnp.array(HOME), still[0], bent, still[1], *still).modes.shape
+        >>> lumped_forces(plant, jnp.array(HOME), still[0], bent, still[1], *still)[1].shape
         (3, 3)
     """
     chain = modal_chain(plant, pose, pose_rate, q, q_rate)
@@ -110,7 +87,5 @@ def lumped_forces(
     found = accelerations(plant, chain, pose_rate, q, q_rate, slider_force, modal_force / mass)
     straight = inverse_dynamics(plant, pose, pose_rate, found.pose)
     jacobian = jax.jacfwd(lambda x: inverse_kinematics(plant, x, jnp.zeros_like(x))[0])(pose)
-    return LumpedForces(
-        platform=jacobian.T @ (straight - slider_force),
-        modes=mass * found.modal + plant.stiffness * q - modal_force,
-    )
+    modes = mass * found.modal + plant.stiffness * q - modal_force
+    return jacobian.T @ (straight - slider_force), modes

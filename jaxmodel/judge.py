@@ -102,7 +102,7 @@ def judge(
         axis n.
 
     Example:
-        >>> structure, case = paper_case(n_modes=2)
+        >>> structure, case = paper_case({"link.modes": 2})
         >>> float(jax.jit(judge, static_argnums=0)(structure, case).gain_margin) > 1
         True
     """

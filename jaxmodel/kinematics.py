@@ -113,6 +113,12 @@ def close_chain(
     Returns:
         Chain. Out of reach or at a singular pose P is replaced by a safe value, so the numbers are
         finite there but meaningless: see `chain_status`.
+
+    Example:
+        >>> plant = prepare(*paper_case({"link.modes": 2})).loop.plant
+        >>> chain = close_chain(plant, jnp.array(HOME), jnp.zeros(3))
+        >>> chain.rho.shape
+        (3,)
     """
     bend = Bend() if bend is None else bend
     x, y, cx, cy, turn = pose[0], pose[1], None, None, None
@@ -260,6 +266,12 @@ def inverse_kinematics(
 
     Returns:
         (rho, rho_rate).
+
+    Example:
+        >>> plant = prepare(*paper_case({"link.modes": 2})).loop.plant
+        >>> rho, rate = inverse_kinematics(plant, jnp.array(HOME), jnp.array([0.1, 0.0, 0.0]))
+        >>> bool(jnp.ptp(rho) < 1e-9)  # all alike at home
+        True
     """
     lanes = over_poses(plant, pose.ndim - 1)
     chain = close_chain(lanes, jnp.moveaxis(pose, -1, 0), jnp.moveaxis(pose_rate, -1, 0))

@@ -95,6 +95,11 @@ def linearise(
 
     Returns:
         LinearPlant.
+
+    Example:
+        >>> structure, case = paper_case({"link.modes": 2, "control.feedback": "none"})
+        >>> linearise(structure, prepare(structure, case).loop, jnp.array(HOME)).state.shape
+        (24, 24)
     """
     check_shape("pose", pose, (structure.n_pose,))
     # friction counts as nothing here: it damps small motion most, the safe side
@@ -253,6 +258,12 @@ def natural_modes(plant: LinearPlant) -> NaturalModes:
     similar shape. For these, frequency means sqrt(lambda_1 lambda_2) and the damping ratio is 1 or
     more (1 where the slow one is zero: held only by damping). Poles of motors that follow late are
     left out.
+
+    Example:
+        >>> structure, case = paper_case({"link.modes": 2, "control.feedback": "none"})
+        >>> modes = natural_modes(linearise(structure, prepare(structure, case).loop, jnp.array(HOME)))
+        >>> bool(modes.frequency[0] > 0)
+        True
     """
     a, late = np.asarray(mechanical(plant)), n_motors(plant)
     m = (a.shape[0] - late) // 2

@@ -383,6 +383,14 @@ def step(structure: Structure, loop: Loop, state: State, inputs: Inputs) -> tupl
 
     Returns:
         (state at the next instant, Record of this one).
+
+    Example:
+        >>> start = begin(*paper_case({"link.modes": 2}))
+        >>> structure = paper_case({"link.modes": 2})[0]
+        >>> first = jax.tree.map(lambda x: x[0], start.inputs)
+        >>> state, record = step(structure, start.loop, start.state, first)
+        >>> float(state.status)
+        0.0
     """
     voltage, clipped = state.controller.voltage, jnp.zeros_like(state.status)
     after = state.controller

@@ -90,6 +90,12 @@ def build_plant(
 
     Returns:
         Plant.
+
+    Example:
+        >>> machine = paper_machine()
+        >>> basis = build_basis("loaded", machine.beam, machine.patches, 3, jnp.full((3, 1), 0.1))
+        >>> build_plant(machine, basis).stiffness.shape
+        (3, 3)
     """
     geometry, masses, beam = machine.geometry, machine.masses, machine.beam
     legs, arms = geometry.legs(), geometry.arms()

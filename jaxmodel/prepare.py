@@ -84,6 +84,11 @@ def prepare(structure: Structure, case: Case) -> Prepared:
 
     Returns:
         Prepared; `status` says what makes the case invalid; the numbers stay finite even then.
+
+    Example:
+        >>> prepared = prepare(*paper_case({"link.modes": 2}))
+        >>> float(prepared.status)
+        0.0
     """
     machine, electronics = case.machine, case.electronics
     bases = find_bases(structure, case)

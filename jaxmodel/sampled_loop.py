@@ -76,6 +76,12 @@ def closed_loop(
 
     Returns:
         LoopMatrices.
+
+    Example:
+        >>> structure, case = paper_case({"link.modes": 2})
+        >>> A, B, C, D = closed_loop(structure, case, HOME).state_space()
+        >>> bool(abs(jnp.linalg.eigvals(A)).max() < 1)
+        True
     """
     check_shape("pose", pose, (structure.n_pose,))
     smooth = structure._replace(is_smooth=True, feedback="sampled")

@@ -110,6 +110,11 @@ def ei(omega: Array, zeta: Array, tolerance: Array) -> Impulses:
         omega: natural frequency of the mode [rad/s], shape ().
         zeta: its damping ratio, in [0, 1) [1], shape ().
         tolerance: V, residual vibration accepted at omega, in [0, 1) [1], shape ().
+
+    Example:
+        >>> impulses = ei(700.0, 0.01, 0.05)
+        >>> len(impulses.amplitude), round(float(jnp.sum(impulses.amplitude)), 12)
+        (3, 1.0)
     """
     tolerance = jnp.asarray(tolerance)
     outer = (1 + tolerance) / 4
@@ -305,6 +310,11 @@ def residual_vibration(impulses: Impulses, omega: Array, zeta: Array) -> Array:
 
     Returns:
         V, in the broadcast shape.
+
+    Example:
+        >>> impulses = ei(700.0, 0.0, 0.05)
+        >>> f"{residual_vibration(impulses, 700.0, 0.0):.2f}"  # the tolerance, at its own frequency
+        '0.05'
     """
     end = shaper_duration(impulses)
 

@@ -6,11 +6,13 @@
 from __future__ import annotations
 
 import inspect
+import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
+import numpy as np
 import typer
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -23,8 +25,11 @@ from studies.commission.spec import Commission
 from studies.documents import DOCUMENTS, schema
 from studies.fitting.spec import ENTRIES, Fit, Next
 from studies.space.spec import Block, Sweep
+from studies.study.cases import build_structure
 from studies.study.explain import allowed_values, unit_of
-from studies.study.spec import OWN_FIELDS, Study
+from studies.study.numbers import one_study
+from studies.study.paths import field_choices
+from studies.study.spec import OWN_FIELDS, Study, paper_study
 from studies.study.template import toml_value
 from studies.tuning.spec import Scenarios, Tune
 
@@ -267,6 +272,51 @@ def filled(page: str) -> str:
     )
 
 
+# fields of the model
+
+
+#: Lists that can have another length, beside those of lists, of which there is one a link.
+LISTS = ("motion.waypoints", "motion.move_time", "motion.dwell", "metrics.stations")
+LISTS += ("electronics.lowpass_ratio", "electronics.lowpass_zeta", "machine.joint_angles_deg")
+LISTS += ("shaper.frequencies_hz",)
+
+
+def model_fields() -> str:
+    """`jaxmodel/fields.json`: the paper's value, unit and range of each number."""
+    study = paper_study()
+    numbers, found = one_study(study, build_structure(study)), {}
+    for name, number in numbers.items():
+        section, _, leaf = name.partition(".")
+        info = Study.model_fields[section].annotation.model_fields[leaf]
+        array, choices = np.asarray(number), field_choices(name)
+        row = {"value": array.tolist(), "shape": array.shape, "unit": unit_of(info)}
+        row["allowed"] = allowed_values(info.annotation, info.metadata)
+        if array.dtype.kind == "i":
+            row["dtype"] = "int"
+        if choices:
+            row["choices"] = choices
+        if limits := _limits_of(info.annotation, info.metadata):
+            row["limits"] = limits
+        of = "entries" if name in LISTS else "links" if array.ndim == 2 else ""
+        found[name] = row | ({"of": of} if of else {})
+    rows = (f" {json.dumps(name)}: {json.dumps(row)}" for name, row in found.items())
+    return "{\n" + ",\n".join(rows) + "\n}\n"
+
+
+def _limits_of(annotation: Any, metadata: Iterable[Any]) -> dict[str, float]:
+    """Bounds of a field's numbers."""
+    found = {
+        sign: float(getattr(item, sign))
+        for item in (*metadata, *getattr(annotation, "__metadata__", ()))
+        for part in (item, *getattr(item, "metadata", ()))
+        for sign in ("ge", "gt", "le", "lt")
+        if isinstance(getattr(part, sign, None), int | float)
+        for item in [part]
+    }
+    inner = [_limits_of(x, ()) for x in get_args(annotation) if not isinstance(x, FieldInfo)]
+    return found or next(filter(None, inner), {})
+
+
 # members of tuples
 
 
@@ -288,6 +338,9 @@ def members_text(source: str) -> dict[str, str]:
     return found
 
 
+MODEL_FIELDS = Path(__file__).parents[2] / "jaxmodel" / "fields.json"
+
 if __name__ == "__main__":
+    MODEL_FIELDS.write_text(model_fields(), encoding="utf-8")
     for path in sorted((Path(__file__).parents[1] / "reference").glob("*.md")):
         path.write_text(filled(path.read_text(encoding="utf-8")), encoding="utf-8")

@@ -14,10 +14,10 @@ from test_notebooks import code_cells, read
 
 from jaxmodel.controller import linear_law
 from jaxmodel.frequency_response import controller_response
+from jaxmodel.numbers import case_of
 from jaxmodel.prepare import prepare
 from studies.engine.preflight import check_run
 from studies.single.plant import controller_of, plant_of
-from studies.study.cases import case_of
 from studies.study.numbers import one_study, position, put
 from studies.study.spec import parse_study
 from tests.documents import page

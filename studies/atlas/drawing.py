@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from studies.show.figures import SERIES, SMALL, WIDTH, axes_or_new, styled
 from studies.show.skeleton import Skeleton, skeleton
-from studies.study.cases import has_stretch
+from studies.study.cases import build_structure
 from studies.study.spec import Study
 
 #: Largest drawn deflection of a link, as a share of its length [1].
@@ -80,7 +80,7 @@ def mode_skeleton(study: Study, pose: np.ndarray, shape: np.ndarray) -> Skeleton
     )
     phases = np.array([0.0, 1.0, -1.0])
     moved = pose + factor * phases[:, None] * shape[:n]
-    bent = q[:, :-1] if has_stretch(study) else q
+    bent = q[:, :-1] if build_structure(study).has_stretch else q
     return skeleton(study, moved, factor * phases[:, None, None] * bent, 1.0)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from jaxmodel.case import Case, Structure, with_ratio
 from jaxmodel.kinematics import close_chain
 from jaxmodel.linear import resting
+from jaxmodel.numbers import signed_power
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, loop_matrices
@@ -25,7 +26,6 @@ from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
 from studies.engine.runs import resolved_study
 from studies.results.labelled import Labelled, derived, labelled, unwritten
-from studies.study.cases import signed_power
 from studies.study.labels import POSE_UNITS
 from studies.study.spec import Study
 from studies.study.window import residual_delay

@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.judge import LoopVerdicts, can_judge, judge
+from jaxmodel.numbers import Numbers, case_of, with_used
 from jaxmodel.parameters import Array
 from jaxmodel.simulate import RunResult
 from studies.engine.function import BlockFunction, fastest_function
@@ -25,8 +26,7 @@ from studies.engine.preflight import check_run
 from studies.engine.steps import fastest_steps
 from studies.errors import StudyError
 from studies.kernels.differentiable import outside
-from studies.study.cases import case_of, with_used
-from studies.study.numbers import Numbers, one_study, position, put
+from studies.study.numbers import one_study, position, put
 from studies.study.paths import known_field, overlaps
 from studies.study.spec import Study
 

@@ -14,6 +14,7 @@ import numpy as np
 from rich.console import Console
 
 from jaxmodel.case import Case, Structure, with_ratio
+from jaxmodel.numbers import signed_power
 from jaxmodel.simulate import RunResult
 from studies.engine.executor import Executor, own_ratios
 from studies.engine.margins import judge_loops, no_margins
@@ -24,7 +25,6 @@ from studies.engine.stability import LoopFigures
 from studies.kernels.compilation import compiler_time
 from studies.phases import Phases
 from studies.space.table import CaseTable
-from studies.study.cases import signed_power
 from studies.study.fields import row_keys
 from studies.threads import COMPILING
 

@@ -13,13 +13,14 @@ import numpy as np
 from jaxmodel import status
 from jaxmodel.case import Case, Structure, uncontrolled, with_ratio
 from jaxmodel.loop_figures import MARGINS
+from jaxmodel.numbers import signed_power
 from jaxmodel.simulate import RunResult, simulate
 from studies.engine.poles import PoleReport, pole_report, tracked_modes
 from studies.engine.preflight import check_run
 from studies.engine.programs import drop_programs, kept_jit
 from studies.engine.robustness import judge_robustness
 from studies.engine.stability import LoopFigures, run_report
-from studies.study.cases import as_numpy, signed_power
+from studies.study.cases import as_numpy
 from studies.study.spec import Study
 from studies.threads import serial_blas
 

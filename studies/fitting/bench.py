@@ -19,6 +19,7 @@ from jaxmodel import status
 from jaxmodel.beam import BASES
 from jaxmodel.case import Structure
 from jaxmodel.kinematics import path_status
+from jaxmodel.numbers import Numbers, case_of, with_used
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.response import BenchPlant, bench_plant, held_modes
@@ -26,9 +27,9 @@ from studies.engine.preflight import check_pose
 from studies.engine.programs import kept_jit
 from studies.errors import StudyError, field_error
 from studies.space.free import Place, Placing
-from studies.study.cases import as_arrays, build_structure, case_of, with_used
+from studies.study.cases import as_arrays, build_structure
 from studies.study.labels import describe
-from studies.study.numbers import Numbers, one_study
+from studies.study.numbers import one_study
 from studies.study.signals import Signal
 from studies.study.spec import Study
 

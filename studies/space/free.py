@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxmodel.case import Case, Structure
+from jaxmodel.numbers import Numbers, case_of
 from jaxmodel.parameters import Array
 from studies.errors import StudyError, field_error, nearest, nearest_field
 from studies.space.axes import ALIASES, READY_MADE, Range, parse_range
-from studies.study.cases import case_of
-from studies.study.numbers import Numbers, position, put
+from studies.study.numbers import position, put
 from studies.study.paths import (
     Parts,
     checked_value,

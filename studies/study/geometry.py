@@ -2,58 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES
-from jaxmodel.table import PartError
-from studies.study.paths import field_value, own_fields
-from studies.study.spec import OWN_MECHANISMS, Study
-
-
-def build_geometry(
-    kind: str, number: Callable[[str], Any], joint_angle: Any, xp: Any
-) -> tuple[Any, Any]:
-    """`Geometry` of a mechanism, and the mass that moves with each near joint [kg].
-
-    Args:
-        kind: name of the mechanism.
-        number: value of a field in its unit.
-        joint_angle: of the platform's joints in its own axes [rad], (..., n).
-        xp: NumPy or `jax.numpy`.
-    """
-    mechanism = MECHANISMS[kind]
-    own = {
-        name.rpartition(".")[2]: number(name) for name in own_fields(OWN_MECHANISMS, [mechanism])
-    }
-    machine = {
-        "guide_side": number("machine.guide_side"),
-        "guide_angle": xp.radians(number("machine.guide_angles_deg")),
-        "guide_offset": number("machine.guide_offsets"),
-        "joint_radius": number("machine.joint_radius"),
-        "joint_angle": joint_angle,
-        "slider_mass": number("machine.slider_mass"),
-    }
-    geometry, near_mass = mechanism.build(own, machine, xp)
-    _check_axes(mechanism.name, geometry, [*own.values(), *machine.values()])
-    return geometry, near_mass
-
-
-def _check_axes(kind: str, geometry: Any, given: list[Any]) -> None:
-    """Raise PartError for an array that ignores the axis of cases, which would be read as one."""
-    if np.ndim(given[-1]) < 2:
-        return
-    known = {1, *(np.shape(x)[0] for x in given)}
-    for name, value in zip(geometry._fields, geometry, strict=True):
-        shape = np.shape(value)
-        if not shape or shape[0] not in known:
-            raise PartError(
-                f"mechanism {kind!r}: {name} of its geometry has shape {shape}; expected an axis "
-                "of cases first, as what it is built from has"
-            )
+from jaxmodel.numbers import build_geometry
+from studies.study.paths import field_value
+from studies.study.spec import Study
 
 
 def machine_geometry(study: Study) -> tuple[Any, np.ndarray]:

@@ -3,7 +3,7 @@
 They are one dictionary: the name of each field, as in the file and in its unit, with an array of a
 shape that the schema decides. Lists of unequal length are padded with NaN, a number that stands for
 all links is there once for each, choices are positions among their names, truth values are 1 or 0.
-`studies.study.cases.case_of` turns them into the arrays of the model.
+`jaxmodel.numbers.case_of` turns them into the arrays of the model.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 
 from jaxmodel.case import Structure
 from jaxmodel.laws.state_space import STATE_SPACE
+from jaxmodel.numbers import Numbers
 from studies.study.consistency import EACH_PATCH
 from studies.study.fields import Columns, Fields, nesting
 from studies.study.paths import Parts, all_fields, field_choices, own_fields, own_place, parse_entry
@@ -27,7 +28,6 @@ from studies.study.spec import OWN_FIELDS, Study
 from studies.study.state_space import system_of
 from studies.study.window import DELAY, residual_delay
 
-Numbers = dict[str, Any]
 #: How a field's array looks, without the axis of cases: () for a number or (n, ...) for a list;
 #: one entry a link, (l,); a list a link, (l, n); one entry for each controlled mode of each link,
 #: (l, C); a position among names; one entry a move, (n,), n = 1 if one stands for all.

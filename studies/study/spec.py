@@ -22,6 +22,9 @@ from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.mechanisms.contract import Mechanism
 from jaxmodel.mechanisms.prrr import PRRR
 from jaxmodel.motion import PROFILES
+from jaxmodel.numbers import OWN_DRIVES as OWN_DRIVES
+from jaxmodel.numbers import OWN_LAWS as OWN_LAWS
+from jaxmodel.numbers import OWN_MECHANISMS as OWN_MECHANISMS
 from jaxmodel.shaper import SHAPERS
 from jaxmodel.table import Table
 from studies.errors import StudyError, field_error
@@ -46,8 +49,7 @@ from studies.study.sizes import (
 )
 from studies.study.state_space import with_matrices
 
-#: Where the own fields of control laws, drives and mechanisms are, `PLACE.NAME.FIELD`.
-OWN_LAWS, OWN_DRIVES, OWN_MECHANISMS = "control.laws", "drive.kinds", "machine.kinds"
+#: Own fields of control laws, drives and mechanisms, by their place.
 OWN_FIELDS: dict[str, Table[Law] | Table[DriveLaw] | Table[Mechanism]] = {
     OWN_LAWS: LAWS,
     OWN_DRIVES: DRIVES,

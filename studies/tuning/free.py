@@ -13,6 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmodel.numbers import Numbers
 from jaxmodel.parameters import Array
 from studies.errors import StudyError, field_error, shown_name
 from studies.space.axes import Range
@@ -26,7 +27,6 @@ from studies.space.free import (
     plain_numbers,
 )
 from studies.study.consistency import patch_centers, patch_pitch
-from studies.study.numbers import Numbers
 from studies.study.paths import Parts
 from studies.study.spec import DESIGN, Study
 

@@ -13,14 +13,13 @@ from jaxmodel.frequency_response import SampledLoopResponse, response_of_loop
 from jaxmodel.linear import resting
 from jaxmodel.linear_residual import linear_residual
 from jaxmodel.loop_figures import MARGINS, PEAKS
+from jaxmodel.numbers import Numbers, case_of
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.robustness import MarginPlace, margin_at, norm_peaks
 from jaxmodel.sampled_loop import LoopMatrices, loop_matrices, slowest_decay, spillover
 from studies.engine.programs import kept_jit
 from studies.engine.robustness import response_and_modes
-from studies.study.cases import case_of
-from studies.study.numbers import Numbers
 from studies.tuning.loop_figures import distance_of_path
 
 #: Unit of violations of `gain_margin`, and the decay rate that counts as stable if no limit of the

@@ -27,10 +27,11 @@ from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
 from jaxmodel.loop_figures import MARGINS, MOST_DELAY, MOST_PHASE, PEAKS
 from jaxmodel.metrics import METRICS
+from jaxmodel.numbers import SWITCHES
 from studies.engine.preflight import check_run
 from studies.errors import StudyError, field_error, nearest, shown, shown_name
 from studies.space.free import FreeNumbers
-from studies.study.cases import SWITCHES, build_structure
+from studies.study.cases import build_structure
 from studies.study.entries import controlled_links, entry_sizes, parse_entries
 from studies.study.explain import explain
 from studies.study.files import read_toml

@@ -14,7 +14,7 @@ from studies.engine.preflight import check_run
 from studies.engine.runs import Run, run_study, uncontrolled_twin
 from studies.errors import StudyError, field_error
 from studies.results.labelled import Labelled, derived, labelled, told
-from studies.study.cases import build_structure, has_stretch
+from studies.study.cases import build_structure
 from studies.study.labels import describe
 from studies.study.spec import Study
 from studies.twin.law import exported_law
@@ -255,7 +255,8 @@ def causes(bench: TwinBench, ours: tuple[Run, Run], base: BothRuns) -> list[Chan
         "twin: twice the elements": {"n_elements": 2 * settings.n_elements},
         "twin: half the step": {"n_steps": 2 * bench.plan.n_steps},
     }
-    for text, changed in list(changes.items())[has_stretch(study) :]:  # both may lengthen
+    both_lengthen = build_structure(study).has_stretch
+    for text, changed in list(changes.items())[both_lengthen:]:
         other = TwinBench(study, settings._replace(**changed))
         pairs = [pair(one, other.run(k == 0)) for k, one in enumerate(ours)]
         found.append(cause(text, pairs[1], pairs[0], window))

@@ -1,6 +1,7 @@
 """The physics without files: a run by its numbers, M, C, K, forces, loop, margins, batches."""
 
 import doctest
+import inspect
 import json
 import os
 import subprocess
@@ -23,88 +24,92 @@ from jaxmodel import (
     paper_case,
     prepare,
     simulate,
-    with_values,
 )
-from jaxmodel.defaults import SWITCHES
 from jaxmodel.dynamics import accelerations, modal_chain
 from jaxmodel.judge import with_margin_modes
-from studies.study import cases
-from studies.study.spec import paper_study
+from jaxmodel.simulate import begin
+from studies.study.cases import build_case, build_structure
+from studies.study.paths import set_values
+from studies.study.spec import paper_study, parse_study
 
 #: A short run of a small model: a move of 5 ms, 5 ms of free vibration.
 QUICK = {
-    "path.waypoints": [[0.0, 0.0, np.pi / 6], [0.0, 0.001, np.pi / 6]],
-    "path.move_time": 0.005,
-    "shaping.kind": "none",
-    "windows.residual_delay": 0.0,
-    "windows.residual_length": 0.005,
+    "run.duration": 0.012,
+    "link.modes": 3,
+    "control.modes": 2,
+    "motion.waypoints": [[0.0, 0.0, np.pi / 6], [0.0, 0.001, np.pi / 6]],
+    "motion.move_time": 0.005,
+    "shaper.kind": "none",
+    "metrics.residual_delay": 0.0,
+    "metrics.residual_length": 0.005,
 }
 RNG = np.random.default_rng(0)
 
 
 @pytest.fixture(scope="module")
 def quick():
-    """Three modes at most, two under control."""
-    return paper_case(QUICK, duration=0.012, n_modes=3, n_controlled=2)
+    return paper_case(QUICK)
 
 
 # --- numbers --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    "choices, changes",
+    "values",
     [
-        ({}, {}),
-        ({"n_modes": 5, "n_controlled": 2}, {"link__modes": 5, "control__modes": 2}),
-        ({"law": "ppf"}, {"control__law": "ppf"}),
-        ({"drive": "sliding_mode"}, {"drive__kind": "sliding_mode"}),
+        {},
+        {"link.modes": 5, "control.modes": 2},
+        {"control.law": "ppf", "control.laws.ppf.filter_damping": 0.4},
+        {"drive.kind": "sliding_mode", "drive.coulomb_friction": 1.0},
+        {"control.notch_hz": (300.0, 0.0, 200.0), "control.damping": (0.1, 0.2, 0.1)},
+        {
+            "patches.centers": ((0.05, 0.15),) * 3,
+            "control.modes": 2,
+            "link.basis": "pinned_free",
+            "run.smooth": True,
+        },
+        {"link.length": 0.22, "motion.move_time": (0.1, 0.2, 0.1, 0.2), "shaper.kind": "zvd"},
     ],
 )
-def test_the_paper_s_run_is_that_of_its_file(choices, changes):
-    study = paper_study().change(**changes, metrics__residual_delay=0.026)
-    structure, case = paper_case(**choices)
-    assert structure == cases.build_structure(study)
-    wanted = cases.build_case(study)
+def test_a_case_is_that_of_a_file_with_the_same_numbers(values):
+    study = paper_study().change(metrics__residual_delay=0.026)
+    study = parse_study(set_values(study, values))
+    structure, case = paper_case(values)
+    assert structure == build_structure(study)
+    wanted = build_case(study)
     assert jax.tree.structure(case) == jax.tree.structure(wanted)
     for found, value in zip(jax.tree.leaves(case), jax.tree.leaves(wanted), strict=True):
-        np.testing.assert_allclose(found, value, rtol=1e-11)
-
-
-def test_what_is_switched_on_is_what_files_switch_on():
-    assert set(SWITCHES) == set(cases.SWITCHES)
-    structure, case = paper_case({"control.notch": [300.0, 0, 0], "drive.coulomb_friction": 1.0})
-    assert structure == paper_case()[0]._replace(has_notch=True, has_friction=True)
-    np.testing.assert_array_equal(case.control.notch, [300, 0, 0])
+        np.testing.assert_allclose(found, value, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
     "values, message",
     [
-        ({"control.gain_facto": 1.0}, "control.gain_facto: no such number.*'gain_factor'"),
-        ({"control": 1.0}, "control: holds n_active, .*; name one"),
-        ({"machine.beams.length": 0.2}, "machine.beams: no such number.*'beam'"),
-        ({"machine.beam.length": 200.0}, r"length = 200; allowed: 0.001 to 10 m$"),
-        ({"machine.beam.length": [0.2, -0.2, 0.2]}, r"length = -0.2; allowed: 0.001 to 10 m$"),
+        ({"control.gain_facto": 1.0}, "control.gain_facto: no such field.*'control.gain_factor'"),
+        ({"link.length": 200.0}, r"link.length = 200; allowed: .* >= 0.001 and <= 10 \[m\]$"),
+        ({"link.length": [0.2, -0.2, 0.2]}, "link.length = -0.2; allowed: "),
         ({"control.velocity_gain": [1.0, 2.0]}, r"shape \(2,\); expected \(3,\) or a number"),
-        ({"control.gain_factor": "much"}, "control.gain_factor = 'much'; expected numbers"),
-        ({"control.gain_factor": np.nan}, "control.gain_factor = nan; allowed: 0 to 1000"),
-        ({"shaping.kind": "eii"}, "shaping.kind = eii: no such choice.*'ei'"),
-        ({"control.notch": 300.0}, "control.notch: left out .* has_notch = True"),
-        ({"machine.patches.center": [[0.05, 0.1]] * 3}, r"shape \(3, 2\); expected \(3, 3\)"),
+        ({"control.gain_factor": "much"}, "gain_factor = 'much'; allowed: a finite number >= 0"),
+        ({"control.gain_factor": np.nan}, "gain_factor = nan; allowed: a finite number >= 0"),
+        ({"control.laws.ppf.damping_ratio": -1}, "no such field"),
+        ({"shaper.kind": "eii"}, "shaper.kind = eii: no such choice; allowed: none, .*'ei'"),
+        ({"control.law": "imcs"}, "control.law = imcs: no such choice.*'imsc'"),
     ],
 )
 def test_wrong_numbers_are_refused(values, message):
     with pytest.raises(ValueError, match=message):
-        with_values(*paper_case(), values)
+        paper_case(values)
 
 
-def test_wrong_choices_are_refused():
-    with pytest.raises(ValueError, match="n_mode: no such choice; did you mean 'n_modes'"):
-        paper_case(n_mode=3)
-    with pytest.raises(ValueError, match="law = imcs: no such choice; did you mean 'imsc'"):
-        paper_case(law="imcs")
+def test_what_must_be_known_before_is_not_traced():
+    for name, message in (
+        ("link.modes", "n_modes: missing; expected the largest link.modes"),
+        ("run.duration", "run.duration: traced"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            jax.jit(lambda x, name=name: paper_case({name: x})[1])(4.0)
     with pytest.raises(ValueError, match=r"pose: shape \(2,\); expected \(3,\)"):
-        equations_of_motion(*paper_case(n_modes=2), HOME[:2])
+        equations_of_motion(*paper_case({"link.modes": 2}), HOME[:2])
 
 
 # --- equations ------------------------------------------------------------------------------------
@@ -113,65 +118,57 @@ def test_wrong_choices_are_refused():
 def test_small_motions_obey_the_equations(quick):
     """M x'' + C x' + K x = F f + V v, by the nonlinear machine."""
     structure, case = quick
-    found = equations_of_motion(structure, case, HOME)
+    mass, damping, stiffness, by_force, by_volts = equations_of_motion(structure, case, HOME)
     loop = prepare(structure, case).loop
     n, links = len(HOME), structure.n_links
-    x, rate = 1e-10 * RNG.standard_normal((2, len(found.mass)))
+    x, rate = 1e-10 * RNG.standard_normal((2, len(mass)))
     x[:n] = 0  # K has no stiffness of the platform
-    force, volts = (
-        1e-3 * RNG.standard_normal(links),
-        1e-3 * RNG.standard_normal(found.voltage.shape[1]),
-    )
+    force, volts = (1e-3 * RNG.standard_normal(y.shape[1]) for y in (by_force, by_volts))
     q, q_rate = (y[n:].reshape(links, -1) for y in (x, rate))
-    straight = np.asarray(HOME)
-    chain = modal_chain(loop.plant, straight, rate[:n], q, q_rate)
+    chain = modal_chain(loop.plant, np.asarray(HOME), rate[:n], q, q_rate)
     piezo = jnp.einsum("irk,ik->ir", loop.actuator, volts.reshape(links, -1))
     moved = accelerations(loop.plant, chain, rate[:n], q, q_rate, force, piezo)
     acceleration = np.concatenate([moved.pose, np.ravel(moved.modal)])
-    left = found.mass @ acceleration + found.damping @ rate + found.stiffness @ x
-    right = found.force @ force + found.voltage @ volts
-    assert np.abs(found.stiffness @ x).max() > 0.1 * np.abs(right).max()
+    left = mass @ acceleration + damping @ rate + stiffness @ x
+    right = by_force @ force + by_volts @ volts
+    assert np.abs(stiffness @ x).max() > 0.1 * np.abs(right).max()
     np.testing.assert_allclose(left, right, atol=1e-6 * np.abs(right).max())
 
 
 def test_matrices_have_the_machine_s_own_modes(quick):
     structure, case = quick
-    found = equations_of_motion(structure, case, HOME, has_drive=True)
-    for matrix in found[:3]:
+    found = equations_of_motion(structure, case, HOME, has_drive=True)[:3]
+    for matrix in found:
         np.testing.assert_allclose(matrix, matrix.T, atol=1e-9 * np.abs(matrix).max())
-    assert np.linalg.eigvalsh(found.mass).min() > 0
+    mass, damping, stiffness = found
+    assert np.linalg.eigvalsh(mass).min() > 0
     free = structure._replace(feedback="none")
     modes = natural_modes(linearise(free, prepare(free, case).loop, np.array(HOME)))
-    poles = np.linalg.eigvals(
-        np.block(
-            [
-                [np.zeros_like(found.mass), np.eye(len(found.mass))],
-                [-np.linalg.solve(found.mass, x) for x in (found.stiffness, found.damping)],
-            ]
-        )
-    )
+    blocks = [np.zeros_like(mass), np.eye(len(mass))]
+    blocks = [blocks, [-np.linalg.solve(mass, x) for x in (stiffness, damping)]]
+    poles = np.linalg.eigvals(np.block(blocks))
     own = np.sort(np.abs(poles[poles.imag > 0])) / (2 * np.pi)
     np.testing.assert_allclose(own[-6:], np.sort(modes.frequency)[-6:], rtol=1e-6)
-    without = equations_of_motion(structure, case, HOME)
-    np.testing.assert_allclose(without.stiffness[:3], 0, atol=1e-6 * np.abs(found.stiffness).max())
+    without = equations_of_motion(structure, case, HOME)[2]
+    np.testing.assert_allclose(without[:3], 0, atol=1e-6 * np.abs(stiffness).max())
 
 
 def test_lumped_forces_are_those_of_the_blocks(quick):
     """t_d = J_pw^T F_a - M_fr X'' - what is off the diagonal of M_ff, T_d = -M_rf q''."""
     structure, case = quick
-    found, plant = equations_of_motion(structure, case, HOME), prepare(structure, case).loop.plant
-    n, links = len(HOME), structure.n_links
-    q = 1e-10 * RNG.standard_normal((links, structure.n_coordinates))
+    mass, _, stiffness, by_force, _ = equations_of_motion(structure, case, HOME)
+    plant, n = prepare(structure, case).loop.plant, len(HOME)
+    q = 1e-10 * RNG.standard_normal((structure.n_links, structure.n_coordinates))
     rate, force = np.zeros(n), np.array([1e-3, -2e-3, 5e-4])
-    lumped = lumped_forces(plant, np.array(HOME), rate, q, 0 * q, force, 0 * q)
-    right = found.force @ force - found.stiffness @ np.concatenate([rate, np.ravel(q)])
-    acceleration = np.linalg.solve(found.mass, right)
+    platform, modes = lumped_forces(plant, np.array(HOME), rate, q, 0 * q, force, 0 * q)
+    right = by_force @ force - stiffness @ np.concatenate([rate, np.ravel(q)])
+    acceleration = np.linalg.solve(mass, right)
     own = np.diag(np.repeat(plant.modal_mass, structure.n_coordinates))
-    modes = found.force[n:] @ force - found.mass[n:, :n] @ acceleration[:n]
-    modes -= (found.mass[n:, n:] - own) @ acceleration[n:]
-    np.testing.assert_allclose(np.ravel(lumped.modes), modes, atol=1e-5 * np.abs(modes).max())
-    platform = -found.mass[:n, n:] @ acceleration[n:]
-    np.testing.assert_allclose(lumped.platform, platform, atol=1e-5 * np.abs(platform).max())
+    wanted = by_force[n:] @ force - mass[n:, :n] @ acceleration[:n]
+    wanted -= (mass[n:, n:] - own) @ acceleration[n:]
+    np.testing.assert_allclose(np.ravel(modes), wanted, atol=1e-5 * np.abs(wanted).max())
+    wanted = -mass[:n, n:] @ acceleration[n:]
+    np.testing.assert_allclose(platform, wanted, atol=1e-5 * np.abs(wanted).max())
 
 
 # --- loops ----------------------------------------------------------------------------------------
@@ -197,25 +194,24 @@ def closed_loop_at(quick, factor):
 # --- batches --------------------------------------------------------------------------------------
 
 
-def drawn(structure, case, count):
-    """Cases with drawn placement, mode counts, gains and controlled links."""
-    center = np.sort(RNG.uniform(0.03, 0.17, (count, 3, structure.n_patches)), axis=2)
+def drawn(count):
+    """Drawn placements, mode counts, gains and controlled links."""
+    center = [0.05, 0.1, 0.15] + RNG.uniform(-0.008, 0.008, (count, 3, 3))
     return {
-        "machine.patches.center": center + [-0.01, 0, 0.01],
-        "n_modes": RNG.integers(1, structure.n_modes + 1, count),
-        "control.n_active": RNG.integers(1, structure.n_controlled + 1, count),
+        "patches.centers": center,
+        "link.modes": RNG.integers(1, 4, count),
+        "control.modes": RNG.integers(1, 3, count),
         "control.gain_factor": RNG.uniform(0, 1, count),
-        "control.link_mask": RNG.integers(0, 2, (count, 3)).astype(float),
+        "control.links": RNG.integers(0, 2, (count, 3)).astype(float),
     }
 
 
-def test_a_thousand_combinations_are_as_many_single_runs(quick):
-    structure, case = quick
-    values, traced = drawn(structure, case, 1000), []
+def test_a_thousand_combinations_are_as_many_single_runs():
+    values, traced = drawn(1000), []
 
     def residual(values):
         traced.append(1)
-        result = simulate(structure, with_values(structure, case, values))
+        result = simulate(*paper_case(QUICK | values, n_modes=3, n_controlled=2))
         return result.metrics.residual_rms, result.metrics.peak_voltage, result.status
 
     many = jax.jit(jax.vmap(residual))(values)
@@ -228,27 +224,21 @@ def test_a_thousand_combinations_are_as_many_single_runs(quick):
     assert len(traced) == 2 and len(np.unique(np.asarray(many[0]).round(12))) > 500
 
 
-def own_loss(structure, case):
-    """A loss of pole decays and EMC ratios."""
-
-    def loss(free):
-        values = {"control.velocity_gain": free[:3], "control.ratio": free[3:].reshape(3, 2)}
-        result = simulate(structure, with_values(structure, case, values))
-        return 1e12 * jnp.sum(result.metrics.residual_rms**2)
-
-    return loss
+def own_loss(free):
+    """A loss of velocity gains and EMC ratios."""
+    values = {"control.velocity_gain": free[:3], "control.ratios": free[3:].reshape(3, 2)}
+    result = simulate(*paper_case(QUICK | {"link.modes": 2, "run.smooth": True} | values))
+    return 1e12 * jnp.sum(result.metrics.residual_rms**2)
 
 
 def test_gradients_and_hessians_of_an_own_loss():
-    structure, case = paper_case(QUICK, duration=0.012, n_modes=2, n_controlled=2, is_smooth=True)
-    loss = jax.jit(own_loss(structure, case))
-    free = np.array([0.8, 0.9, 0.9, 1, 0.3, 1, 0.3, 1, 0.3])
-    slope = jax.jit(jax.grad(loss))(free)
+    loss, free = jax.jit(own_loss), np.array([0.8, 0.9, 0.9, 1, 0.3, 1, 0.3, 1, 0.3])
+    slope = jax.jit(jax.grad(own_loss))(free)
     for k in (0, 4):
         step = 1e-4 * np.eye(9)[k]
         wanted = (loss(free + step) - loss(free - step)) / 2e-4
-        assert slope[k] == pytest.approx(wanted, rel=1e-5)
-    curvature = np.asarray(jax.jit(jax.hessian(loss))(free))
+        assert float(slope[k]) == pytest.approx(float(wanted), rel=1e-5)
+    curvature = np.asarray(jax.jit(jax.hessian(own_loss))(free))
     assert np.isfinite(curvature).all() and np.abs(curvature).max() > 0
     np.testing.assert_allclose(curvature, curvature.T, atol=1e-8 * np.abs(curvature).max())
 
@@ -258,10 +248,9 @@ import json, sys
 import jax, numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec as P
 jax.config.update("jax_enable_x64", True)
-from jaxmodel import paper_case, simulate, with_values
-structure, case = paper_case(json.loads(sys.argv[1]), duration=0.012, n_modes=2, n_controlled=2)
+from jaxmodel import paper_case, simulate
 def run(gain):
-    return simulate(structure, with_values(structure, case, {"control.gain_factor": gain}))
+    return simulate(*paper_case(json.loads(sys.argv[1]) | {"control.gain_factor": gain}))
 gains = np.linspace(0.1, 1, 8)
 program = jax.vmap(lambda gain: run(gain).metrics.residual_rms)
 alone = jax.jit(program)(gains)
@@ -286,14 +275,14 @@ def test_a_batch_on_four_devices_is_that_on_one():
 
 # --- examples -------------------------------------------------------------------------------------
 
-FUNCTIONS = [x for x in jaxmodel.__all__ if callable(getattr(jaxmodel, x))]
+FUNCTIONS = [x for x in jaxmodel.__all__ if inspect.isfunction(getattr(jaxmodel, x))]
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_every_public_name_has_an_example_that_runs(name):
+def test_every_public_function_has_an_example_that_runs(name):
     one = getattr(jaxmodel, name)
     given = vars(jaxmodel) | {x: getattr(jaxmodel, x) for x in jaxmodel.__all__}
-    given |= {"jax": jax, "jnp": jnp, "np": np}
+    given |= {"jax": jax, "jnp": jnp, "np": np, "begin": begin}
     (test,) = doctest.DocTestFinder(recurse=False).find(one, name, globs=given)
     assert test.examples, f"{name} has no example"
     said = []

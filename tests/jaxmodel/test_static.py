@@ -13,13 +13,14 @@ from jaxmodel.beam import build_basis, left_out_of_loads
 from jaxmodel.electronics import PASSED, voltage_passage
 from jaxmodel.linear import linearise
 from jaxmodel.loop import deflection
+from jaxmodel.numbers import case_of
 from jaxmodel.piezo import actuator_constant, sensor_constant
 from jaxmodel.prepare import prepare
 from studies.engine.margins import judge_loops
 from studies.engine.programs import kept_jit
 from studies.engine.stability import loop_report
 from studies.fitting.bench import Bench, response
-from studies.study.cases import as_arrays, build_case, build_cases, build_structure, case_of
+from studies.study.cases import as_arrays, build_case, build_cases, build_structure
 from studies.study.signals import INPUTS, OUTPUTS, Signal, parse_signal
 from tests.bare import paper_study
 

@@ -11,6 +11,7 @@ import pytest
 
 import studies
 from jaxmodel.mechanisms import MECHANISMS
+from jaxmodel.numbers import case_of
 from jaxmodel.simulate import simulate
 from studies import sources
 from studies.atlas import drawing
@@ -18,7 +19,7 @@ from studies.cli import main
 from studies.engine.preflight import check_run
 from studies.extensions import VARIABLE, extend
 from studies.space.spec import parse_sweep
-from studies.study.cases import build_structure, case_of
+from studies.study.cases import build_structure
 from studies.study.numbers import one_study
 from studies.study.spec import Study
 from studies.sweeps.run import make_plan

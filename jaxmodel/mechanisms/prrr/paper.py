@@ -16,6 +16,10 @@ def paper_machine() -> Machine:
 
     Values not given in the paper (E, density, width, I_p, damping, PZT permittivity and
     density) are the estimates listed in docs/theory.md.
+
+    Example:
+        >>> paper_machine().beam.length
+        0.2
     """
     return Machine(
         geometry=GuideGeometry(

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.metrics import METRICS, Metrics
+from jaxmodel.numbers import Numbers, case_of
 from jaxmodel.parameters import Array
 from studies.engine.function import fastest_function
 from studies.engine.plan import lane_unit, padded_rows
@@ -19,9 +20,7 @@ from studies.errors import StudyError
 from studies.fitting.kinds.contract import Measurement
 from studies.fitting.kinds.motions import check_finished, smooth_run
 from studies.space.free import Place, Placing
-from studies.study.cases import case_of
 from studies.study.entries import Entries
-from studies.study.numbers import Numbers
 from studies.study.spec import Study
 
 

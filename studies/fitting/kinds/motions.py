@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.case import Structure
+from jaxmodel.numbers import Numbers, case_of, with_used
 from jaxmodel.parameters import Array
 from jaxmodel.simulate import simulate
 from studies.engine.preflight import check_run
@@ -17,9 +18,9 @@ from studies.engine.programs import kept_jit
 from studies.errors import StudyError
 from studies.fitting.bench import with_outputs_at, with_slopes
 from studies.space.free import Place
-from studies.study.cases import as_arrays, case_of, with_used
+from studies.study.cases import as_arrays
 from studies.study.labels import describe
-from studies.study.numbers import Numbers, one_study
+from studies.study.numbers import one_study
 from studies.study.signals import Signal
 from studies.study.spec import Study
 

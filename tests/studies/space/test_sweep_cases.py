@@ -8,12 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxmodel.numbers import case_of
 from studies.engine.results import read_sweep
 from studies.errors import StudyError
 from studies.space.methods import morris_points, saltelli_points
 from studies.space.spec import load_sweep
 from studies.space.table import build_table, case_study
-from studies.study.cases import as_arrays, build_case, build_cases, build_structure, case_of
+from studies.study.cases import as_arrays, build_case, build_cases, build_structure
 from studies.study.fields import Fields, padded
 from studies.study.numbers import study_numbers
 from tests.bare import parse_sweep
