@@ -2,14 +2,13 @@ from .bases import find_bases
 from .beam import BASES, build_basis
 from .case import Case, Structure
 from .control import efficient_modal_control, pole_placement
-from .defaults import paper_case
+from .defaults import HOME, paper_case, paper_machine
 from .dynamics import accelerations, kinetic_energy, potential_energy
 from .equations import equations_of_motion, lumped_forces
 from .judge import judge
 from .kinematics import close_chain, inverse_kinematics
 from .linear import frequency_response, linearise, natural_modes
 from .loop import step
-from .mechanisms.prrr.paper import HOME, paper_machine
 from .parameters import Machine
 from .plant import build_plant
 from .prepare import prepare

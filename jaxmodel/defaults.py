@@ -1,39 +1,29 @@
 """The paper's closed-loop run, or one with other numbers: where work without files begins.
 
-Numbers have the names, units and ranges of study files. `fields.json` holds these and the paper's
-values; it is written from the schema of files (`make reference`).
+Numbers have the names, units and ranges of study files, see `jaxmodel.fields`.
 """
 
 from __future__ import annotations
 
-import json
 import operator
 from collections.abc import Mapping
 from difflib import get_close_matches
-from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.drives import DRIVES
+from jaxmodel.fields import fields
 from jaxmodel.laws import LAWS
 from jaxmodel.lazy import jax, jnp
+from jaxmodel.mechanisms.prrr.guides import HOME as HOME
 from jaxmodel.numbers import OWN_DRIVES, OWN_LAWS, Numbers, case_of, is_used, structure_of
-from jaxmodel.parameters import Array
+from jaxmodel.parameters import Array, Machine
 from jaxmodel.table import PartError
 
 #: One number for each patch, which follows the placement.
 _OF_PATCHES = ("patches.sensor_factor", "patches.actuator_factor")
-
-
-@cache
-def fields() -> dict[str, dict[str, Any]]:
-    """What each field of a file is: the paper's value, unit, limits, names of its choices."""
-    text = Path(__file__).with_name("fields.json").read_text(encoding="utf-8")
-    found: dict[str, dict[str, Any]] = json.loads(text)
-    return found
 
 
 def paper_case(
@@ -101,6 +91,19 @@ def paper_case(
     }
     structure = structure_of(value, sizes, is_needed)
     return structure, case_of(structure, numbers)
+
+
+def paper_machine() -> Machine:
+    """The paper's 3-PRR manipulator, whose links keep their length.
+
+    Values not given in the paper (E, density, width, I_p, damping, PZT permittivity and density)
+    are the estimates listed in docs/theory.md.
+
+    Example:
+        >>> paper_machine().beam.length.tolist()
+        [0.2, 0.2, 0.2]
+    """
+    return paper_case({"link.stretch": False})[1].machine
 
 
 def _size(numbers: Numbers, name: str, argument: str) -> int:

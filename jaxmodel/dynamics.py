@@ -569,7 +569,7 @@ def kinetic_energy(
         >>> rate, q = jnp.array([0.1, 0.0, 0.0]), jnp.zeros((3, 3))
         >>> chain = close_chain(plant, jnp.array(HOME), rate)
         >>> f"{kinetic_energy(plant, chain, rate, q, q):.2e} J"
-        '3.36e-03 J'
+        '5.97e-03 J'
     """
     bq, bq_rate = jnp.sum(plant.b * q, axis=1), jnp.sum(plant.b * q_rate, axis=1)
     swing = plant.tip_mass * chain.chord * chain.sine + chain.cosine * bq
@@ -606,6 +606,6 @@ def potential_energy(plant: Plant, q: Num[Array, "links Q"]) -> Num[Array, ""]:
     Example:
         >>> plant = prepare(*paper_case({"link.modes": 2})).loop.plant
         >>> f"{potential_energy(plant, 1e-5 * jnp.eye(3)):.2e} J"
-        '5.67e-04 J'
+        '5.69e-04 J'
     """
     return jnp.sum(plant.stiffness * q * q) / 2

@@ -261,8 +261,8 @@ def natural_modes(plant: LinearPlant) -> NaturalModes:
 
     Example:
         >>> structure, case = paper_case({"link.modes": 2, "control.feedback": "none"})
-        >>> modes = natural_modes(linearise(structure, prepare(structure, case).loop, jnp.array(HOME)))
-        >>> bool(modes.frequency[0] > 0)
+        >>> plant = linearise(structure, prepare(structure, case).loop, jnp.array(HOME))
+        >>> bool(natural_modes(plant).frequency[0] > 0)
         True
     """
     a, late = np.asarray(mechanical(plant)), n_motors(plant)

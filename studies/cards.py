@@ -9,25 +9,8 @@ from studies.result import Summary
 from studies.results.labelled import Labelled
 from studies.show.report import Report, plain
 
-#: Module with the function `say`, by the name of the result's type.
-SAY = {
-    "Certificate": "studies.spillover.say",
-    "CommissionFindings": "studies.commission.say",
-    "ComparedVariants": "studies.export.comparison",
-    "Exported": "studies.export.say",
-    "Fitted": "studies.fitting.say",
-    "LawFindings": "studies.laws.say",
-    "NamedModes": "studies.single.modes",
-    "PlannedSweep": "studies.sweeps.dry_run",
-    "SweepResult": "studies.sweeps.say",
-    "Simulation": "studies.single.say",
-    "AtlasFindings": "studies.atlas.say",
-    "ModelVerification": "studies.verify.say",
-    "TuneFindings": "studies.tuning.say",
-    "TwinResult": "studies.twin.say",
-}
-
-
+#: Modules that tell of results of another package.
+TELLERS = {"NamedModes": "studies.single.modes"}
 #: Function that makes the document of a result that is none itself.
 DOCUMENT = {
     "Fitted": "studies.fitting.document.fit_document",
@@ -49,9 +32,15 @@ def document_of(result: Any) -> Labelled:
 
 
 def report_of(result: Any) -> Report:
-    """What is told of a result of a type in SAY."""
-    made: Report = import_module(SAY[type(result).__name__]).say(result)
+    """What is told of a result."""
+    made: Report = teller(type(result)).say(result)
     return made
+
+
+def teller(kind: type) -> Any:
+    """The module whose `say` tells of results of a type: its own, or that of its package."""
+    own = import_module(TELLERS.get(kind.__name__, kind.__module__))
+    return own if hasattr(own, "say") else import_module(f"{own.__package__}.say")
 
 
 def card(result: Any) -> str:

@@ -24,7 +24,7 @@ _KINDS: dict[str, tuple[Any, str]] = {
     "None": (type(None), "None"),
     "Sequence": (list | tuple, "a list of numbers"),
     "Mapping": (Mapping, "numbers by name"),
-    "Place": (int | str | Path | None, "a number of processes, a scheduler's address or file"),
+    "Place": (Integral | str | Path | None, "a number of processes, a scheduler's address or file"),
 }
 
 
@@ -48,15 +48,12 @@ def verb(function: F) -> F:
 
 def _check(name: str, value: Any, annotation: str) -> None:
     parts = [part.partition("[")[0] for part in annotation.split(" | ")]
-    if not all(part in _KINDS for part in parts):  # types of its own, which a verb checks
-        parts = parts if isinstance(value, str) else []
+    if not {*parts} <= _KINDS.keys():  # types of its own, which a verb checks
+        return
     label = name.upper() if name == "what" else f"--{name.replace('_', '-')}"
-    kinds = [_KINDS[part] for part in parts if part in _KINDS]
-    is_right = any(isinstance(value, kind) for kind, _ in kinds)
-    if isinstance(value, bool) and "bool" not in parts:
-        is_right = False
-    if kinds and not is_right:
-        raise field_error(label, value, " or ".join(text for _, text in kinds))
+    kinds, words = zip(*(_KINDS[part] for part in parts), strict=True)
+    if not isinstance(value, kinds) or (isinstance(value, bool) and "bool" not in parts):
+        raise field_error(label, value, " or ".join(words))
     if name == "out" and value == "":
         raise StudyError("--out: an empty name; name a file or a folder")
     if isinstance(value, float) and not math.isfinite(value):

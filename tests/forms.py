@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.beam import build_basis
-from jaxmodel.mechanisms.prrr.paper import paper_machine
+from jaxmodel.defaults import paper_machine
 from jaxmodel.plant import build_plant
 from studies.reference import lagrangian as reference
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from jaxmodel.defaults import HOME
 from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES
-from jaxmodel.mechanisms.prrr.paper import HOME
 from tests.bare import parse_study
 
 ANGLES = np.array([2 * np.pi / 3, 4 * np.pi / 3, 0.0])

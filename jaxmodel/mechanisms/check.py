@@ -12,10 +12,10 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from jaxmodel.fields import fields
 from jaxmodel.mechanisms.carriers import Crank, Rail
 from jaxmodel.mechanisms.contract import Mechanism, Near
-from jaxmodel.mechanisms.prrr.guides import GuideGeometry
-from jaxmodel.mechanisms.prrr.paper import paper_machine
+from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES
 from jaxmodel.table import PartError, check_parameters
 
 #: Relative error of the links' lengths.
@@ -26,7 +26,7 @@ def check_mechanism(mechanism: Mechanism) -> None:
     """Raise PartError if a mechanism, or what it builds, violates its contract."""
     place = f"mechanism {mechanism.name!r}"
     _check_description(place, mechanism)
-    n, own_link = mechanism.n_links, paper_machine().beam.length
+    n, own_link = mechanism.n_links, _number("link.length")[0]
     geometry, mass = _built(place, mechanism)
     x, y = _far_joints(place, mechanism, geometry)
     legs = _call(place, "legs", geometry.legs, np)
@@ -67,15 +67,21 @@ def _check_description(place: str, mechanism: Mechanism) -> None:
     check_parameters(place, mechanism.parameters)
 
 
+def _number(name: str) -> np.ndarray:
+    """The paper's value of a field."""
+    return np.array(fields()[name]["value"])
+
+
 def _built(place: str, mechanism: Mechanism) -> tuple[Any, Any]:
     """Geometry, and mass with each near joint, from default numbers."""
-    paper, n = paper_machine(), mechanism.n_links
-    given = paper.geometry
-    assert isinstance(given, GuideGeometry)
+    n = mechanism.n_links
     machine = {
-        **{name: np.resize(getattr(given, name), n) for name in given._fields},
-        "guide_side": np.asarray(given.guide_side),
-        "slider_mass": np.full(n, paper.masses.slider_mass),
+        "guide_angle": np.resize(np.radians(_number("machine.guide_angles_deg")), n),
+        "guide_offset": np.resize(_number("machine.guide_offsets"), n),
+        "joint_radius": np.resize(_number("machine.joint_radius"), n),
+        "joint_angle": np.resize(ASSEMBLIES["inward"], n),
+        "guide_side": _number("machine.guide_side"),
+        "slider_mass": np.resize(_number("machine.slider_mass"), n),
     }
     own = {x.name: np.full(n, float(x.default)) for x in mechanism.parameters}
     found = _call(place, "build", mechanism.build, own, machine, np)

@@ -49,12 +49,8 @@ def parse_workers(workers: Place) -> int | str | None:
     Raises:
         StudyError: it is neither.
     """
-    if workers is None or type(workers) is int:
-        return workers
-    if not isinstance(workers, str | Path):
-        raise field_error(
-            "workers", workers, "a number of processes, a scheduler's address or file"
-        )
+    if workers is None:
+        return None
     text = str(workers)
     return int(text) if re.fullmatch(r"[+-]?\d+", text) else text
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from jaxmodel import dynamics
 from jaxmodel.beam import build_basis
+from jaxmodel.defaults import paper_machine
 from jaxmodel.mechanisms.prrr.guides import GuideGeometry
-from jaxmodel.mechanisms.prrr.paper import paper_machine
 from jaxmodel.parameters import Damping, Masses
 from jaxmodel.plant import build_plant
 from studies.engine.programs import kept_jit

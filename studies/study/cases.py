@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -70,14 +70,8 @@ def in_working_precision(cases: Tree) -> Tree:
 
 def as_arrays(case: Tree) -> Tree:
     """Every leaf as an array of the working precision (integers stay integers)."""
-    real = jnp.result_type(float)
-
-    def leaf(x: Any) -> Any:
-        x = np.asarray(x)
-        # converted by NumPy and put there by JAX, without compiling anything
-        return jax.device_put(x if np.issubdtype(x.dtype, np.integer) else x.astype(real))
-
-    arrays: Tree = jax.tree.map(leaf, case)
+    # converted by NumPy and put there by JAX, without compiling anything
+    arrays: Tree = jax.device_put(in_working_precision(as_numpy(case)))
     return arrays
 
 

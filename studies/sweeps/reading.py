@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from studies.config import start
-from studies.errors import StudyError, field_error
+from studies.errors import StudyError
 from studies.result import Result
 from studies.verbs import check_file, verb
 
@@ -83,8 +83,6 @@ def best(
     """
     if tolerance and not breaks:
         raise StudyError("--tolerance: for --breaks only; give both")
-    if count < 1:
-        raise field_error("--count", count, "a whole number from 1")
     if breaks:
         start()
     from studies.sweeps.documents import best_document

@@ -16,6 +16,7 @@ from studies.result import Result, in_folder
 from studies.results.labelled import Labelled, Variable
 from studies.screen.run import ScreenOutcome
 from studies.show.units import count_text
+from studies.verbs import verb
 
 if TYPE_CHECKING:
     import pandas
@@ -85,6 +86,7 @@ class SweepResult(Result):
 
         return table(self.found)
 
+    @verb
     def best(self, by: str, subject_to: str = "", count: int = 10) -> pandas.DataFrame:
         """The best cases by a metric, as `studies.sweeps.show.best_cases`."""
         from studies.sweeps.show import best_cases

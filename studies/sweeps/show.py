@@ -99,11 +99,6 @@ def best_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10) 
     Raises:
         StudyError: an argument that is none, unknown metric, or no case left.
     """
-    for field, text in (("by", by), ("subject_to", subject_to)):
-        if not isinstance(text, str):
-            raise field_error(field, text, "a text")
-    if not isinstance(count, int) or count < 1:
-        raise field_error("count", count, "a whole number from 1")
     name = by.removeprefix("-")
     cases = ranked_cases(data, by, subject_to, count)
     text = resolution_warning(data, cases, name)
@@ -148,6 +143,8 @@ def _frame(data: SweepData, columns: dict[str, np.ndarray], cases: np.ndarray) -
 
 def ranked_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10) -> np.ndarray:
     """Numbers of the best cases; arguments and errors as `best_cases`, but no warning."""
+    if count < 1:
+        raise field_error("--count", count, "a whole number from 1")
     name, is_large = by.removeprefix("-"), direction(by) == "largest"
     value = metric_values(data, name)
     if value.dtype.kind not in "fiub":

@@ -12,8 +12,8 @@ import jax
 import numpy as np
 
 from jaxmodel.case import Case, Structure
+from jaxmodel.defaults import HOME
 from jaxmodel.linear import linearise, natural_modes
-from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import prepare
 from jaxmodel.simulate import simulate
 from studies.engine.programs import kept_jit

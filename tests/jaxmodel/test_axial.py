@@ -11,10 +11,10 @@ import pytest
 import studies
 from jaxmodel import axial, status
 from jaxmodel.bases import find_bases
+from jaxmodel.defaults import HOME
 from jaxmodel.dynamics import modal_chain
 from jaxmodel.kinematics import close_chain
 from jaxmodel.linear import Moment, linearise, natural_modes
-from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import prepare
 from jaxmodel.simulate import command
 from studies.engine.preflight import check_run

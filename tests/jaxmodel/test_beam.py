@@ -11,7 +11,7 @@ import pytest
 from jaxmodel import piezo
 from jaxmodel.bases import find_bases
 from jaxmodel.beam import BASES, build_basis, held_frequency, pinned_free_roots
-from jaxmodel.mechanisms.prrr.paper import paper_machine
+from jaxmodel.defaults import paper_machine
 from jaxmodel.parameters import Damping
 from jaxmodel.plant import damping_ratio
 from jaxmodel.prepare import coupled_rate

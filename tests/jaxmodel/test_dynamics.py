@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from jaxmodel import dynamics, kinematics, status
+from jaxmodel.defaults import HOME
 from jaxmodel.mechanisms.prrr.guides import ASSEMBLIES
-from jaxmodel.mechanisms.prrr.paper import HOME
 from studies.reference import lagrangian as reference
 from tests.forms import (
     MACHINE,

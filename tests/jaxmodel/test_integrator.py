@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from jaxmodel.defaults import HOME
 from jaxmodel.drive import Reference
 from jaxmodel.dynamics import kinetic_energy, modal_chain, potential_energy
 from jaxmodel.integrator import exponential_step
 from jaxmodel.kinematics import inverse_kinematics
 from jaxmodel.loop import PlantState, plant_rates, plant_step
-from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import prepare
 from studies.engine.programs import kept_jit
 from studies.reference import lagrangian as reference

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.integrate import cumulative_simpson
 
+from jaxmodel.defaults import HOME
 from jaxmodel.joints import joint_decay, rub
 from jaxmodel.kinematics import link_direction
 from jaxmodel.loop import PlantState
-from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.plant import build_plant
 from jaxmodel.prepare import STIFFNESS_LIMIT
 from jaxmodel.simulate import simulate

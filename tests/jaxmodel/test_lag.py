@@ -4,10 +4,10 @@ import jax
 import numpy as np
 import pytest
 
+from jaxmodel.defaults import HOME
 from jaxmodel.drive import late_response
 from jaxmodel.frequency_response import command_gain, controller_response, response_of_loop
 from jaxmodel.linear import linearise, mass_and_stiffness, natural_modes
-from jaxmodel.mechanisms.prrr.paper import HOME
 from studies.engine.loop_gain import loop_gains
 from studies.engine.margins import judge_loops
 from studies.engine.preflight import check_run

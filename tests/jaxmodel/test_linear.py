@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from jaxmodel.case import Structure
+from jaxmodel.defaults import HOME
 from jaxmodel.linear import flatten, frequency_response, linearise, natural_modes, unflatten
 from jaxmodel.loop import PlantState
-from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import prepare
 from jaxmodel.return_difference import assembled_modes, loop_response
 from jaxmodel.simulate import _about

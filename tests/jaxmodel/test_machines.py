@@ -11,8 +11,8 @@ from matplotlib.colors import to_rgb
 
 from jaxmodel import dynamics, kinematics, status
 from jaxmodel.beam import build_basis
+from jaxmodel.defaults import HOME
 from jaxmodel.mechanisms.prrr.guides import Guides
-from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.plant import build_plant
 from studies import cli
 from studies.engine.columns import case_variables

@@ -10,12 +10,12 @@ import pytest
 from jaxmodel import kinematics, status
 from jaxmodel.axial import stretch_error
 from jaxmodel.case import uncontrolled
+from jaxmodel.defaults import paper_machine
 from jaxmodel.frequency_response import assembled, plant_response
 from jaxmodel.linear import linearise
 from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.mechanisms.check import check_mechanism
 from jaxmodel.mechanisms.five_bar.cranks import FiveBarGeometry
-from jaxmodel.mechanisms.prrr.paper import paper_machine
 from jaxmodel.mechanisms.rrr.cranks import CrankGeometry
 from jaxmodel.prepare import prepare
 from jaxmodel.table import PartError

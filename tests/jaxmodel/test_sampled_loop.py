@@ -9,10 +9,10 @@ import scipy.interpolate
 import scipy.linalg
 
 from jaxmodel import sampled_loop
+from jaxmodel.defaults import HOME
 from jaxmodel.linear import linearise, natural_modes
 from jaxmodel.linear_residual import linear_residual
 from jaxmodel.loop_figures import LOWEST
-from jaxmodel.mechanisms.prrr.paper import HOME
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import (
     closed_loop,

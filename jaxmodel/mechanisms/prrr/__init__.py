@@ -1,8 +1,7 @@
 """3-PRR: sliders on straight guides carry the links, which hold a rigid platform."""
 
 from jaxmodel.mechanisms.contract import Mechanism
-from jaxmodel.mechanisms.prrr.guides import build
-from jaxmodel.mechanisms.prrr.paper import HOME
+from jaxmodel.mechanisms.prrr.guides import HOME, build
 
 PRRR = Mechanism(
     name="prrr",

@@ -11,6 +11,8 @@ from jaxmodel.mechanisms.carriers import Rail
 from jaxmodel.mechanisms.contract import SINGULAR_MARGIN, Near, polar, safe_root
 from jaxmodel.parameters import Array, Num, PerLink
 
+#: Home pose (x [m], y [m], phi [rad]) of the paper.
+HOME = (0.0, 0.0, np.pi / 6)
 #: Body angles psi [rad] of the platform joints for the two assemblies that fit the paper's text.
 ASSEMBLIES = {
     "inward": (np.pi / 2, 7 * np.pi / 6, 11 * np.pi / 6),

@@ -9,7 +9,7 @@ import pytest
 
 from jaxmodel import status
 from jaxmodel.bases import find_bases
-from jaxmodel.mechanisms.prrr.paper import HOME
+from jaxmodel.defaults import HOME
 from jaxmodel.prepare import _is_too_fast
 from jaxmodel.simulate import _share_on
 from studies import config
