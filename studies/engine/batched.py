@@ -30,6 +30,10 @@ from studies.study.numbers import one_study, position, put
 from studies.study.paths import known_field, overlaps
 from studies.study.spec import Study
 
+#: Numbers of modes that can be fewer than the study's, and what stands for controlled links.
+COUNTS, SUBSETS = ("link.modes", "control.modes"), "link_subsets"
+LABELS = {SUBSETS: "control.links"}
+
 
 def batched(study: Study, names: Sequence[str], is_judged: bool = False) -> Callable[[Array], Any]:
     """A study's results as a JAX function of some of its numbers, for many cases.
@@ -39,7 +43,9 @@ def batched(study: Study, names: Sequence[str], is_judged: bool = False) -> Call
     Args:
         study: what all cases share.
         names: of the numbers that vary, as in files: fields, which then have one value for all
-            that they stand for, or entries of lists, such as `control.velocity_gain[0]`.
+            that they stand for, or entries of lists, such as `control.velocity_gain[0]`. Also
+            `link.modes` and `control.modes`, at most those of the study; `control.links[0]` and
+            alike, 1 or 0; `link_subsets`, 1, 2, 4.. for each controlled link, added up.
         is_judged: also judge the loops, see `jaxmodel.judge`.
 
     Returns:
@@ -96,10 +102,12 @@ def _judge_program(
         )
     shared, build = one_study(study, structure), _Build(structure, positions)
     steps = fastest_steps([])
+    has_links = any(field in (SUBSETS, LABELS[SUBSETS]) for field, _ in positions)
+    n_active = structure.n_links if has_links else max(1, sum(study.control.links))
 
     def run(parameters: Array) -> LoopVerdicts:
         cases = jax.vmap(lambda free: build(free, None, shared))(parameters)
-        return judge(structure, cases, steps, max(1, sum(study.control.links)))
+        return judge(structure, cases, steps, n_active)
 
     return run
 
@@ -110,12 +118,14 @@ def _positions(study: Study, names: Sequence[str]) -> tuple[Any, ...]:
     if not is_list or not names or not all(isinstance(name, str) for name in names):
         raise StudyError(f"names: {names!r}; expected names of numbers, such as ['drive.kp']")
     for k, name in enumerate(names):
-        value = known_field(name, study, f"names[{k}]")
-        if not _is_real(value) or name in STATIC:
-            raise StudyError(f"names[{k}]: {name!r} = {value}; expected real numbers, not sizes")
-        if any(overlaps(name, other) for other in names[:k]):
+        name = LABELS[name] if name == SUBSETS else name
+        value = known_field(name, study, f"names[{k}]", [SUBSETS])
+        is_number = _is_real(value) or name in COUNTS or name.startswith(LABELS[SUBSETS])
+        if not is_number or name in STATIC:
+            raise StudyError(f"names[{k}]: {name!r} = {value}; expected real numbers, not choices")
+        if any(overlaps(name, LABELS.get(other, other)) for other in names[:k]):
             raise StudyError(f"names[{k}]: {name!r} is there twice")
-    return tuple(position(study, name) for name in names)
+    return tuple((SUBSETS, ...) if x == SUBSETS else position(study, x) for x in names)
 
 
 def _is_real(value: Any) -> bool:
@@ -155,7 +165,11 @@ class _Build:
     def __call__(self, free: Array, own: Any, shared: Numbers) -> Case:
         numbers = shared
         for k, at in enumerate(self.positions):
-            numbers = put(numbers, at, free[k])
+            value = free[k]
+            if at[0] == SUBSETS:
+                at = LABELS[SUBSETS], ...
+                value = jnp.floor(value / 2.0 ** jnp.arange(self.structure.n_links)) % 2
+            numbers = put(numbers, at, value)
         return case_of(self.structure, numbers)
 
 

@@ -11,13 +11,14 @@ import pytest
 from jax.sharding import AxisType, PartitionSpec
 
 from jaxmodel import status
+from jaxmodel.simulate import simulate
 from studies.engine.batched import batched
 from studies.engine.runs import run_study
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.kernels import bridge, native
 from studies.kernels.traced import InputLeaf, trace_loop
-from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.cases import as_arrays, build_case, build_cases, build_structure
 from tests.canonical import TINY, study_of
 
 #: One mode and one patch, which make small programs.
@@ -180,10 +181,10 @@ def test_parameters_of_another_shape_are_refused(smooth, parameters, said):
     [
         ("control.gainfactor", "unknown field; did you mean 'control.gain_factor'"),
         ("control.velocity_gain[3]", "no such entry"),
-        ("control.modes", "expected real numbers"),
+        ("electronics.adc_bits", "expected real numbers"),
         ("shaper.kind", "expected real numbers"),
         ("shaper.frequencies_hz", "= (); expected real numbers"),
-        ("run.duration", "not sizes"),
+        ("run.duration", "not choices"),
         ("drive.pulse_force[0]", "is there twice"),
     ],
 )
@@ -277,3 +278,39 @@ def test_gain_margins_have_derivatives():
 def test_loops_that_only_eigenvalues_judge_are_named(changes, named):
     with pytest.raises(StudyError, match=re.escape(named)):
         batched(STUDY.change(**changes), NAMES, is_judged=True)
+
+
+#: What a study has at most: two modes, one of them under control, and two patches.
+MANY = STUDY.change(link__modes=2, patches__centers=[[0.07, 0.13]] * 3, control__gain_factor=0.05)
+
+
+def test_counts_and_links_vary_in_one_program():
+    """Placement, numbers of modes, gain and controlled links at once, as their own studies."""
+    names = ["link.modes", "patches.centers[0][0]", "control.gain_factor", "link_subsets"]
+    values = np.array(
+        [[2, 0.07, 0.05, 7], [1, 0.06, 0.1, 5], [2, 0.08, 0.1, 0], [1, 0.05, 0.02, 2]]
+    )
+    run = jax.jit(batched(MANY, names, is_judged=True))
+    found, judged = run(values)
+    apart = jax.jit(batched(MANY, [*names[:3], *(f"control.links[{k}]" for k in range(3))]))
+    links = np.array([[1, 1, 1], [1, 0, 1], [0, 0, 0], [0, 1, 0]])
+    again = apart(np.concatenate([values[:, :3], links], axis=1))
+    np.testing.assert_allclose(found.metrics.residual_rms, again.metrics.residual_rms, rtol=1e-12)
+    columns = {
+        "link.modes": values[:, 0].astype(int),
+        "patches.centers": np.array([[[x, 0.13], *[[0.07, 0.13]] * 2] for x in values[:, 1]]),
+        "control.gain_factor": values[:, 2],
+        "control.links": links.astype(bool),
+    }
+    structure = build_structure(MANY)
+    cases = build_cases(MANY, columns, structure)
+    cases = jax.tree.map(lambda x: np.broadcast_to(x, (4, *x.shape[1:])), cases)
+    wanted = jax.jit(jax.vmap(partial(simulate, structure)))(cases)
+    np.testing.assert_array_equal(found.status, wanted.status)
+    np.testing.assert_allclose(found.metrics.residual_rms, wanted.metrics.residual_rms, rtol=1e-7)
+    loop = loop_report(structure, build_case(MANY), HOME)
+    assert float(judged.gain_margin[0]) == pytest.approx(loop.gain_margin, rel=1e-3)
+    with pytest.raises(StudyError, match="'control.links' is there twice"):
+        batched(MANY, ["control.links[0]", "link_subsets"])
+    with pytest.raises(StudyError, match="control.law"):
+        batched(MANY, ["control.law"])
