@@ -26,11 +26,7 @@ _KINDS = {
 
 @verb
 def explore(
-    what: str | Path,
-    out: str | Path | None = None,
-    *,
-    subject_to: str = "",
-    progress: bool = True,
+    what: str | Path, out: str | Path | None = None, *, subject_to: str = "", progress: bool = True
 ) -> Explorer:
     """Write a page on which all cases can be looked at: brushed plots, tables, motion.
 

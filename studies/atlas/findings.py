@@ -84,11 +84,7 @@ def adc_step(study: Study) -> np.ndarray:
 
 
 def evaluate_atlas(
-    study: Study,
-    choices: Subsets,
-    subsets: Subsets | None,
-    dropped: list[str],
-    job: Job,
+    study: Study, choices: Subsets, subsets: Subsets | None, dropped: list[str], job: Job
 ) -> AtlasFindings:
     """All of the atlas except the runs of the subsets.
 

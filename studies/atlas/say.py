@@ -182,10 +182,7 @@ def _contributions(findings: AtlasFindings) -> Chapter | None:
             [label, *(", ".join(f"{x:.2f}" for x in link) for link in share)]
             for label, share in zip(labels, shares, strict=True)
         ]
-        drawn = [
-            drawing(figures.mode_shares, findings),
-            drawing(figures.interactions, findings),
-        ]
+        drawn = [drawing(figures.mode_shares, findings), drawing(figures.interactions, findings)]
     return chapter(
         "Contributions of links",
         """Shapley shares of links in the mean square that control of all of them removes from all

@@ -2,6 +2,6 @@
 
 In: a kind of work. Out: figures by name. `run` is the one call for everything.
 
-- `works`: runs and sweeps of this program.
+- `works`: runs of this program.
 - `gradients`: derivatives of such runs.
 """

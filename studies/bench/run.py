@@ -5,16 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from studies.bench.gradients import bench_gradients
-from studies.bench.works import bench_runs, bench_sweep
-from studies.errors import StudyError, field_error
+from studies.bench.works import bench_runs
+from studies.errors import field_error
 from studies.kernels.cpu import full_effort
 from studies.result import Result
 from studies.results.labelled import Labelled, told
 from studies.show.listing import Rows
 from studies.show.report import Report
 
-#: Cases of the work `sweep`.
-SWEEP_CASES = 100_000
 #: Most cases per chunk.
 MOST = 2**20
 
@@ -30,27 +28,11 @@ class Benchmark(Labelled, Result, command="bench", version=3):
         return Report("Benchmark", [], "", "", [Rows(["figure", "value"], rows)], [], {})
 
 
-def benchmarked(work: str, executor: str, batch: int, cases: int) -> Benchmark:
+def benchmarked(work: str, executor: str, batch: int) -> Benchmark:
     """Measure; arguments and errors as `studies bench`."""
-    _check(work, executor, batch, cases)
-    if work == "sweep":
-        return Benchmark(bench_sweep(cases or SWEEP_CASES))
+    if not 0 <= batch <= MOST:
+        raise field_error("--batch", batch, f"0 to {MOST}", "1")
     with full_effort():
         if work == "grad":
             return Benchmark(bench_gradients(executor, batch))
         return Benchmark(bench_runs(work or "W1", executor, batch))
-
-
-def _check(work: str, executor: str, batch: int, cases: int) -> None:
-    """Reject options out of range, or without an effect."""
-    ranges = ("--batch", batch, MOST), ("--cases", cases, SWEEP_CASES * MOST)
-    for name, number, most in ranges:
-        if not 0 <= number <= most:
-            raise field_error(name, number, f"0 to {most}", "1")
-    if work == "sweep":
-        options, reason = {"--executor": executor, "--batch": batch}, "with --work sweep"
-    else:
-        options, reason = {"--cases": cases}, "but with --work sweep"
-    for name, value in options.items():
-        if value:
-            raise StudyError(f"{name} {value}: not allowed {reason}; leave it out")

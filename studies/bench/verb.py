@@ -11,18 +11,17 @@ if TYPE_CHECKING:
 
 
 @verb
-def bench(work: str = "", *, executor: str = "", batch: int = 0, cases: int = 0) -> Benchmark:
+def bench(work: str = "", *, executor: str = "", batch: int = 0) -> Benchmark:
     """Measure speed and memory on this machine.
 
     Args:
-        work: W0, W1, W8, grad or sweep; default: W1.
+        work: W0, W1, W8 or grad; default: W1.
         executor: kernel, scan or gpu; default: the fastest.
         batch: cases per chunk; 0: automatic.
-        cases: in the sweep; 0: 100,000.
 
     Raises:
-        StudyError: an unknown option, or one that has no effect.
+        StudyError: an unknown option.
     """
     from studies.bench.run import benchmarked
 
-    return benchmarked(work, executor, batch, cases)
+    return benchmarked(work, executor, batch)

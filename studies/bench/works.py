@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import statistics
-import tempfile
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -19,38 +17,12 @@ from studies import config
 from studies.engine.executor import Executor
 from studies.engine.function import STEPPERS
 from studies.engine.plan import Layout, even_layout, most_lanes, peak_memory
-from studies.engine.results import read_sweep
 from studies.errors import StudyError, field_error
-from studies.job import working
 from studies.kernels.compilation import compiler_time
 from studies.kernels.llvm import is_available
 from studies.reference.tables import BARE
-from studies.space.spec import parse_sweep
 from studies.study.cases import build_cases, build_structure, in_working_precision
 from studies.study.spec import paper_study
-from studies.sweeps.run import sweep_phases, swept_into
-
-#: A sweep of very short runs: ten samples of a released link, so that the engine itself is timed.
-SHORT_RUNS: dict[str, Any] = {
-    "title": "benchmark of the sweep engine",
-    "run": {"duration": 1e-3},
-    "link": {"modes": 1},
-    "control": {"modes": 1},
-    "motion": {"waypoints": [[0.0, 0.0, 0.5235987755982988]]},
-    "shaper": {"kind": "none"},
-    "initial": {"modal": [[1e-6], [1e-6], [1e-6]]},
-    "metrics": {"residual_length": 1e-3},
-    "sweep": {
-        "method": "sobol",
-        "metrics": ["residual_rms"],
-        "axes": {
-            "gain": {"from": 0.1, "to": 1.0},
-            "drive.kp": {"from": 1e4, "to": 4e4},
-            "link.damping_ratio": {"from": 0.001, "to": 0.05},
-        },
-    },
-}
-
 
 #: Workloads of closed-loop runs, 0.8 s at 10 kHz, by their differences from the paper's study.
 WORKS: dict[str, dict[str, Any]] = {
@@ -178,7 +150,7 @@ def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
         StudyError: unknown work or executor, or one that is not installed.
     """
     if work not in WORKS:
-        raise field_error("--work", work, ", ".join(map(repr, (*WORKS, "grad", "sweep"))))
+        raise field_error("--work", work, ", ".join(map(repr, (*WORKS, "grad"))))
     check_executor(executor)
     config.require_configured()
     layout = make_layout(batch)
@@ -209,34 +181,4 @@ def _errors(
         name: float(f"{np.nanmax(np.abs(a - b)) / max(np.nanmax(np.abs(b)), 1e-300):.2g}")
         for name, b in reference.metrics.items()
         for a in [result.metrics[name]]
-    }
-
-
-def bench_sweep(cases: int) -> dict[str, Any]:
-    """Time and peak memory of a sweep of very short runs, chunk files and joining included.
-
-    Args:
-        cases: how many.
-    """
-    data = SHORT_RUNS | {"sweep": SHORT_RUNS["sweep"] | {"count": cases}}
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "sweep"
-        spec = parse_sweep(data)
-        with working("sweep", out, None, sweep_phases(spec), progress=False) as job:
-            result = swept_into(spec, job)
-        size = sum(file.stat().st_size for file in out.rglob("*.h5"))
-        rms = read_sweep(out)["residual_rms"]
-    return {
-        "work": "sweep",
-        "executor": result.executor,
-        "cases": result.n_run,
-        "configs_per_s": round(result.n_run / result.run_time, 1),
-        "run_s": round(result.run_time, 2),
-        "compile_s": round(result.compile_time, 2),
-        "peak_mib": round(peak_memory() / 2**20, 1),
-        "file_mib": round(size / 2**20, 1),
-        "device": str(jax.devices()[0].device_kind),
-        "dtype": str(rms.dtype),
-        "steps": 10,
-        "fingerprint": float(np.mean(rms)),
     }

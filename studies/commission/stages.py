@@ -12,12 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from studies.commission.findings import CommissionFindings
-from studies.commission.machines import (
-    Possible,
-    margin_spread,
-    margins_on,
-    unknown_to_controller,
-)
+from studies.commission.machines import Possible, margin_spread, margins_on, unknown_to_controller
 from studies.commission.spec import RESERVE, MeasuredSpec, certified_margin, tuning_section
 from studies.engine.design import load_design
 from studies.engine.fast_motion import TellingMotion, find_motion, with_own_motion

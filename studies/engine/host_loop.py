@@ -60,11 +60,7 @@ def sampled_loop(
 
 
 def link_poles(
-    state: np.ndarray,
-    n_links: int,
-    n_tracked: int,
-    n_rigid: int | None = None,
-    n_motors: int = 0,
+    state: np.ndarray, n_links: int, n_tracked: int, n_rigid: int | None = None, n_motors: int = 0
 ) -> np.ndarray:
     """Poles [rad/s] of the uncontrolled link modes, by order, then ascending, (J, n_links).
 

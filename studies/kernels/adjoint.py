@@ -96,12 +96,7 @@ def _loop(
     changes = changes_of(results)
     order = needed_by(changes, records)
     return TracedLoop(
-        leaves=leaves,
-        changes=changes,
-        order=order,
-        dtype=dtype,
-        bodies={},
-        records=tuple(records),
+        leaves=leaves, changes=changes, order=order, dtype=dtype, bodies={}, records=tuple(records)
     )
 
 

@@ -61,11 +61,7 @@ def say(findings: LawFindings) -> Report:
         next_steps="""each tuned controller is a study file in this folder: `studies certify`
         certifies it, `studies export` writes it for a real-time controller.""",
         top=[drawing(plots.comparison, findings, name="laws"), drawing(plots.grid, findings)],
-        chapters=[
-            *_controllers(findings),
-            _tunings(findings),
-            _method(findings),
-        ],
+        chapters=[*_controllers(findings), _tunings(findings), _method(findings)],
         files={"Study file": study},
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -49,30 +49,23 @@ class ShardWork(NamedTuple):
     stop: threading.Event  # once set, no further shards are begun
 
 
-class Screener(Protocol):
-    """Where shards are run."""
-
-    def tallies(self, work: ShardWork) -> Iterator[tuple[int, Tally | str]]:
-        """Each shard with its tally, or with the reason why it was given up."""
-        ...
+#: Each shard with its tally, or with the reason why it was given up.
+Answers = Iterator[tuple[int, Tally | str]]
 
 
-class LocalScreener:
-    """Runs shards in this process, and makes the designs of the next one meanwhile."""
+def tallies_here(work: ShardWork) -> Answers:
+    """Run shards in this process, and make the designs of the next one meanwhile."""
+    screen = work.screen
 
-    def tallies(self, work: ShardWork) -> Iterator[tuple[int, Tally | str]]:
-        """As the protocol says."""
-        screen = work.screen
+    def make(shard: int) -> tuple[int, CaseTable]:
+        return shard, table_of(screen, shard)
 
-        def make(shard: int) -> tuple[int, CaseTable]:
-            return shard, table_of(screen, shard)
-
-        with ThreadPoolExecutor(1) as pool:
-            for shard, table in _one_ahead(pool, make, work.shards):
-                tally = shard_tally(screen, shard, table, work.stop, work.progress.add)
-                if tally is None:
-                    return
-                yield shard, tally
+    with ThreadPoolExecutor(1) as pool:
+        for shard, table in _one_ahead(pool, make, work.shards):
+            tally = shard_tally(screen, shard, table, work.stop, work.progress.add)
+            if tally is None:
+                return
+            yield shard, tally
 
 
 def _one_ahead(

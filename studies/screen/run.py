@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from studies.engine.fidelity import Agreement, agreement
 from studies.errors import StudyError
 from studies.job import Job
 from studies.phases import interrupts
-from studies.screen.local import Screener, ScreenProgress, ShardWork
+from studies.screen.local import Answers, ScreenProgress, ShardWork
 from studies.screen.selection import Selection, select
 from studies.screen.shards import ScreenRequest
 from studies.screen.stored import begin, write_tally
@@ -45,13 +46,15 @@ def chosen(done: ScreenOutcome) -> Selection:
     return done.selection
 
 
-def run_screen(screen: ScreenRequest, job: Job, screener: Screener) -> ScreenOutcome:
+def run_screen(
+    screen: ScreenRequest, job: Job, tallies: Callable[[ShardWork], Answers]
+) -> ScreenOutcome:
     """Run what is left of a screen.
 
     Args:
         screen: from `screen_of`.
         job: with `PHASES`.
-        screener: of the shards.
+        tallies: runs shards, here or on workers.
 
     Returns:
         ScreenOutcome; nothing is chosen yet.
@@ -68,7 +71,7 @@ def run_screen(screen: ScreenRequest, job: Job, screener: Screener) -> ScreenOut
     agreed = _agreement(screen)
     progress = ScreenProgress(job.phases, screen.n_designs, tally.n_designs)
     with interrupts() as stop:
-        for shard, answer in screener.tallies(ShardWork(screen, left, progress, stop)):
+        for shard, answer in tallies(ShardWork(screen, left, progress, stop)):
             if isinstance(answer, str):
                 lost[shard] = answer
                 job.say(f"shard {shard} is left out: {answer}")

@@ -4,34 +4,27 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Iterator
 from contextlib import closing
 from functools import lru_cache
 
 from studies.cluster.remote import Remote
-from studies.screen.local import ShardWork
+from studies.screen.local import Answers, ShardWork
 from studies.screen.shards import ScreenRequest, screen_of, shard_tally, table_of
 from studies.screen.tally import Tally
 from studies.space.spec import parse_sweep
 
 
-class ClusterScreener:
-    """Runs shards on a cluster; a `studies.screen.local.Screener`."""
-
-    def __init__(self, remote: Remote) -> None:
-        self._remote = remote
-
-    def tallies(self, work: ShardWork) -> Iterator[tuple[int, Tally | str]]:
-        """As the protocol says."""
-        screen, progress = work.screen, work.progress
-        progress.say(f"workers: {self._remote.n_workers}; each compiles before its first shard")
-        common = json.dumps(screen.spec.data), screen.shard_size
-        jobs = ((shard, (*common, shard)) for shard in work.shards)
-        with closing(self._remote.map(run_shard, jobs, work.stop)) as answered:
-            for shard, answer in answered:
-                if not isinstance(answer, str):
-                    progress.add(answer.endings)
-                yield shard, answer
+def tallies_on(remote: Remote, work: ShardWork) -> Answers:
+    """Run shards on a cluster."""
+    screen, progress = work.screen, work.progress
+    progress.say(f"workers: {remote.n_workers}; each compiles before its first shard")
+    common = json.dumps(screen.spec.data), screen.shard_size
+    jobs = ((shard, (*common, shard)) for shard in work.shards)
+    with closing(remote.map(run_shard, jobs, work.stop)) as answered:
+        for shard, answer in answered:
+            if not isinstance(answer, str):
+                progress.add(answer.endings)
+            yield shard, answer
 
 
 def run_shard(spec: str, shard_size: int, shard: int) -> Tally:

@@ -63,9 +63,7 @@ class LinkSection(Section):
         "mass that bending moves along the link: half of it at the platform joint, or every point",
     )
     static_correction: bool = described(
-        True,
-        "-",
-        "static correction for the modes left out; false: the paper's truncated model",
+        True, "-", "static correction for the modes left out; false: the paper's truncated model"
     )
     length: EachLink[Annotated[float, Field(ge=1e-3, le=10)]] = described(
         0.2, "m", "length L", free=DESIGN

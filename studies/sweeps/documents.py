@@ -7,12 +7,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from jaxmodel import status
-from studies.engine.results import (
-    SweepData,
-    direction,
-    swept_names,
-    uncontrolled_value,
-)
+from studies.engine.results import SweepData, direction, swept_names, uncontrolled_value
 from studies.results.breaking import BrokenCase
 from studies.results.labelled import Labelled, told
 from studies.space.methods import Analysis
@@ -26,13 +21,7 @@ from studies.sweeps.records import (
     with_others,
 )
 from studies.sweeps.sensitivity import Cause, failure_causes
-from studies.sweeps.show import (
-    is_ranked,
-    ranked_cases,
-    ranking,
-    ranking_warnings,
-    requirement,
-)
+from studies.sweeps.show import is_ranked, ranked_cases, ranking, ranking_warnings, requirement
 
 #: A value of a case: of an axis or a metric.
 Cell: TypeAlias = bool | int | float | str | list[Any] | None

@@ -41,12 +41,12 @@ from studies.errors import StudyError
 from studies.job import Job
 from studies.phases import Phases, interrupts
 from studies.result import in_folder
-from studies.screen.local import LocalScreener, Screener
+from studies.screen.local import Answers, ShardWork, tallies_here
 from studies.screen.run import PHASES as SCREEN_PHASES
 from studies.screen.run import choose, chosen, run_screen
 from studies.screen.shards import ScreenRequest, screen_of, shard_groups
 from studies.screen.stored import TALLY, best_sweep, read_tally
-from studies.screen.workers import ClusterScreener, run_shard
+from studies.screen.workers import run_shard, tallies_on
 from studies.space.designs import design_of
 from studies.space.spec import READING, SPREADING, Sweep, SweepSpec, parse_sweep
 from studies.space.table import CaseTable, build_table
@@ -155,16 +155,19 @@ def swept_into(
 
         if not spec.sweep.keep:
             return _run_rest(spec, job, runner_of(spec))
-        screener = ClusterScreener(remote) if remote else LocalScreener()
-        return _run_kept(spec, job, screener, runner_of)
+        tallies = partial(tallies_on, remote) if remote else tallies_here
+        return _run_kept(spec, job, tallies, runner_of)
 
 
 def _run_kept(
-    spec: SweepSpec, job: Job, screener: Screener, runner_of: Callable[[SweepSpec], Runner]
+    spec: SweepSpec,
+    job: Job,
+    tallies: Callable[[ShardWork], Answers],
+    runner_of: Callable[[SweepSpec], Runner],
 ) -> SweepResult:
     """Find the best designs and run them, further ones until enough meet the sweep's condition."""
     screen, count = screen_of(spec), spec.sweep.keep
-    found, done = run_screen(screen, job, screener), None
+    found, done = run_screen(screen, job, tallies), None
     while True:
         found = choose(found, count, job)
         kept = chosen(found).kept

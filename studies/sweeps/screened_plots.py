@@ -55,11 +55,7 @@ def values(done: ScreenOutcome, uncontrolled: float | None) -> Figure:
     figure, axes = figures.one_panel(2.6)
     part = slice(seen[0], seen[-1] + 1)
     axes.stairs(
-        counts[part],
-        edges[seen[0] : seen[-1] + 2],
-        fill=True,
-        color=figures.SERIES[0],
-        alpha=0.6,
+        counts[part], edges[seen[0] : seen[-1] + 2], fill=True, color=figures.SERIES[0], alpha=0.6
     )
     for value, color, style in (
         (chosen(done).kept_value[-1], figures.SERIES[1], "-"),

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
@@ -38,10 +39,10 @@ from studies.laws import tuning as laws_tuning
 from studies.laws.candidates import drive_candidates, law_candidate
 from studies.laws.tuning import Budget
 from studies.phases import Phases
-from studies.screen.local import LocalScreener, ScreenProgress, ShardWork
+from studies.screen.local import ScreenProgress, ShardWork, tallies_here
 from studies.screen.run import PHASES, run_screen
 from studies.screen.shards import screen_of, table_of
-from studies.screen.workers import ClusterScreener
+from studies.screen.workers import tallies_on
 from studies.sweeps.run import sweep_phases, swept_into
 from studies.tuning.run import make_evaluator
 from studies.tuning.workers import ClusterEvaluator
@@ -115,7 +116,7 @@ def test_shards_of_a_screen_come_back_with_their_own_tallies(cluster):
     with Phases(Console(quiet=True), PHASES, is_quiet=True) as phases:
         phases.begin("screen")
         work = ShardWork(screen, range(4), ScreenProgress(phases, 200, 0), stop)
-        there = dict(ClusterScreener(cluster.remote).tallies(work))
+        there = dict(tallies_on(cluster.remote, work))
     assert sorted(there) == [0, 1, 2, 3] and sum(x.n_designs for x in there.values()) == 200
     for shard, found in there.items():
         wanted = judged(screen, shard, table_of(screen, shard), stop)
@@ -126,8 +127,8 @@ def test_shards_of_a_screen_come_back_with_their_own_tallies(cluster):
 def test_a_screen_has_the_same_tally(cluster, tmp_path):
     screen = small_screen()
     tallies = []
-    there = ClusterScreener(cluster.remote)
-    for name, screener in (("here", LocalScreener()), ("there", there)):
+    there = partial(tallies_on, cluster.remote)
+    for name, screener in (("here", tallies_here), ("there", there)):
         (tmp_path / name).mkdir()
         job = Job(tmp_path / name, Phases(Console(quiet=True), PHASES, is_quiet=True))
         done = run_screen(screen, job, screener)

@@ -20,7 +20,7 @@ from studies.errors import StudyError
 from studies.job import working
 from studies.results.labelled import Variable
 from studies.screen import selection, shards
-from studies.screen.local import LocalScreener
+from studies.screen.local import tallies_here
 from studies.screen.run import PHASES, choose, run_screen
 from studies.screen.selection import select
 from studies.screen.shards import axis_columns, screen_of
@@ -74,11 +74,11 @@ def kept(sweep=SWEEP, **more):
     return small_spec({"fidelity": "linear", "keep": KEEP, "margin": 0.0} | sweep | more)
 
 
-def screened(out, sweep=SWEEP, screener=None, shard_size=32, **more):
+def screened(out, sweep=SWEEP, tallies=tallies_here, shard_size=32, **more):
     """What a sweep finds before it runs the best by the full model."""
     screen = screen_of(kept(sweep, **more), shard_size)
     with working("sweep", out, None, PHASES, resume=True, progress=False) as job:
-        found = run_screen(screen, job, screener or LocalScreener())
+        found = run_screen(screen, job, tallies)
         return choose(found, screen.spec.sweep.keep, job)
 
 
@@ -326,7 +326,7 @@ def test_designs_with_the_margin_asked_for_are_kept(whole, swept, tmp_path):
     for margin in (1.0, 2.5, 4.0):
         is_wanted = (data["gain_margin"] >= margin) & (data["status"] == status.OK)
         order = np.flatnonzero(is_wanted)[np.argsort(value[is_wanted])][:KEEP]
-        found = screened(out, screener=Stopped(0), margin=margin)
+        found = screened(out, tallies=stopped_after(0), margin=margin)
         assert found.selection.kept.row.tolist() == data.table.row[order].tolist()
         assert f"with a gain margin of at least {margin:g}" in screen_lines(found)[1]
         assert_same(found.tally, done.tally)
@@ -414,17 +414,16 @@ def test_candidates_that_end_before_enough_are_found_are_told(whole, monkeypatch
     assert "no more than the best" in " ".join(screen_lines(done._replace(screen=asked)))
 
 
-class Stopped(LocalScreener):
+def stopped_after(count):
     """Ends after some shards, as if it had been killed."""
 
-    def __init__(self, count):
-        self._count = count
-
-    def tallies(self, work):
-        for k, answer in enumerate(super().tallies(work)):
-            if k == self._count:
+    def tallies(work):
+        for k, answer in enumerate(tallies_here(work)):
+            if k == count:
                 raise StudyError("killed")
             yield answer
+
+    return tallies
 
 
 def test_an_interrupted_screen_goes_on(whole, tmp_path):
@@ -432,7 +431,7 @@ def test_an_interrupted_screen_goes_on(whole, tmp_path):
     out = tmp_path / "out"
     for count in (1, 2):
         with pytest.raises(StudyError, match="killed"):
-            screened(out, screener=Stopped(count))
+            screened(out, tallies=stopped_after(count))
     is_done, _ = read_tally(out, done.screen)
     assert is_done.tolist() == [True, True, True, False]
     resumed = screened(out)
@@ -444,17 +443,15 @@ def test_an_interrupted_screen_goes_on(whole, tmp_path):
         screened(out, by="residual_rms[link=1][station=2]")
 
 
-class Lossy(LocalScreener):
+def lossy_tallies(work):
     """Gives a shard up."""
-
-    def tallies(self, work):
-        for shard, tally in super().tallies(work):
-            yield shard, "its workers died" if shard == 2 else tally
+    for shard, tally in tallies_here(work):
+        yield shard, "its workers died" if shard == 2 else tally
 
 
 def test_a_lost_shard_is_said_and_retried(whole, tmp_path):
     _, done = whole
-    lossy = screened(tmp_path / "out", screener=Lossy())
+    lossy = screened(tmp_path / "out", tallies=lossy_tallies)
     assert lossy.lost == {2: "its workers died"}
     assert lossy.tally.n_designs == 128 - 32
     assert_same(screened(tmp_path / "out").tally, done.tally)
@@ -463,14 +460,13 @@ def test_a_lost_shard_is_said_and_retried(whole, tmp_path):
 def test_ctrl_c_keeps_what_is_finished(whole, tmp_path):
     out = tmp_path / "out"
 
-    class Pressed(LocalScreener):
-        def tallies(self, work):
-            for answer in super().tallies(work):
-                yield answer
-                work.stop.set()
+    def pressed(work):
+        for answer in tallies_here(work):
+            yield answer
+            work.stop.set()
 
     with pytest.raises(KeyboardInterrupt, match="^32 of 128 designs are safe$"):
-        screened(out, screener=Pressed())
+        screened(out, tallies=pressed)
     assert read_tally(out, whole[1].screen)[0].sum() == 1
     assert_same(screened(out).tally, whole[1].tally)
 
@@ -729,7 +725,7 @@ def test_a_sweep_that_was_stopped_anywhere_goes_on(finished, tmp_path, monkeypat
             patch.setattr(owner, name, once)
             run(kept(), out, out.exists())
 
-    stopped(LocalScreener, "tallies")
+    stopped(sweeps_run, "tallies_here")
     stopped(sweeps_run, "choose")
     with pytest.raises(StudyError, match="not yet run the designs to keep; go on with --resume"):
         read_sweep(out)
