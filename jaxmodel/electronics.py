@@ -130,3 +130,8 @@ def _phi(rate: Array) -> list[Array]:
             series = series * -small + 1 / factorial[n + k]
         result.append(jnp.where(is_small, series, last))
     return result
+
+
+def observed(by_q: Array, by_voltage: Array, q: Array, voltage: Array) -> Array:
+    """What coordinates show, and voltages at once, (3, n)."""
+    return jnp.sum(by_q * q[:, None], axis=2) + jnp.sum(by_voltage * voltage[:, None], axis=2)

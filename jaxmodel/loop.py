@@ -18,7 +18,7 @@ from jaxmodel.controller import Controller, ControllerState, controller_step, so
 from jaxmodel.drive import Reference, drive_step, late_force, motor_force, slider_force
 from jaxmodel.drives.contract import DriveState
 from jaxmodel.dynamics import Accelerations, accelerations, modal_chain, shortening_row
-from jaxmodel.electronics import Amplifier
+from jaxmodel.electronics import Amplifier, observed
 from jaxmodel.hysteresis import Hysteresis
 from jaxmodel.integrator import Exponential
 from jaxmodel.joints import rub
@@ -385,12 +385,9 @@ def step(structure: Structure, loop: Loop, state: State, inputs: Inputs) -> tupl
         (state at the next instant, Record of this one).
 
     Example:
-        >>> start = begin(*paper_case({"link.modes": 2}))
-        >>> structure = paper_case({"link.modes": 2})[0]
-        >>> first = jax.tree.map(lambda x: x[0], start.inputs)
-        >>> state, record = step(structure, start.loop, start.state, first)
-        >>> float(state.status)
-        0.0
+        >>> structure, case = paper_case({"link.modes": 2})
+        >>> loop, inputs, state, _ = begin(structure, case)
+        >>> state, record = step(structure, loop, state, jax.tree.map(lambda x: x[0], inputs))
     """
     voltage, clipped = state.controller.voltage, jnp.zeros_like(state.status)
     after = state.controller
@@ -414,11 +411,6 @@ def filtered_voltage(loop: Loop, plant: PlantState) -> Array:
     if plant.direct_z is None or loop.left_out is None:
         return jnp.sum(loop.sensor * plant.z[:, None], axis=2)
     return observed(loop.sensor, loop.left_out.sensor, plant.z, plant.direct_z)
-
-
-def observed(by_q: Array, by_voltage: Array, q: Array, voltage: Array) -> Array:
-    """What coordinates show, and voltages at once, (3, n)."""
-    return jnp.sum(by_q * q[:, None], axis=2) + jnp.sum(by_voltage * voltage[:, None], axis=2)
 
 
 def advance(

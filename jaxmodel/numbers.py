@@ -7,7 +7,7 @@ of length 1 where they do not vary.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from jaxmodel.parameters import Beam, Damping, Machine, Masses, Patches
 from jaxmodel.table import PartError
 
 Numbers = dict[str, Any]
+Tree = TypeVar("Tree")  # a Case, or numbers
 TWO_PI = 2 * np.pi
 #: Where the own fields of control laws, drives and mechanisms are, `PLACE.NAME.FIELD`.
 OWN_LAWS, OWN_DRIVES, OWN_MECHANISMS = "control.laws", "drive.kinds", "machine.kinds"
@@ -53,6 +54,8 @@ SWITCHES = {
     "has_poles": ("control.damping", "control.pole_decay"),
     "has_position_gain": ("control.position_gain", "control.damping", "control.pole_decay"),
 }
+#: Fields whose largest values decide a structure.
+OF_STRUCTURE = {"link.modes", "control.modes", *(x for names in SWITCHES.values() for x in names)}
 #: Values other than 0 at which a field of `SWITCHES` needs nothing.
 NEUTRAL = {"electronics.delay": 1.0}
 #: Duration of a move that only pads a path with fewer moves [s].
@@ -103,7 +106,7 @@ def structure_of(
         has_position_gain=LAWS[value("control.law")].has_position,
         is_smooth=value("run.smooth"),
     )._replace(**sizes)
-    return with_used(structure, filter(used, {x for names in SWITCHES.values() for x in names}))
+    return with_used(structure, filter(used, OF_STRUCTURE))
 
 
 def with_used(structure: Structure, fields: Iterable[str]) -> Structure:
@@ -164,6 +167,17 @@ def _library(numbers: Numbers) -> Any:
     """NumPy if all numbers are NumPy's, otherwise JAX's."""
     leaves = jax.tree.leaves(numbers)
     return np if all(isinstance(x, np.ndarray | np.generic) for x in leaves) else jnp
+
+
+def in_working_precision(cases: Tree) -> Tree:
+    """NumPy leaves in JAX's working precision (integers stay integers)."""
+    real = np.dtype(jnp.result_type(float))
+
+    def cast(x: np.ndarray) -> np.ndarray:
+        return x if np.issubdtype(x.dtype, np.integer) else x.astype(real)
+
+    changed: Tree = jax.tree.map(cast, cases)
+    return changed
 
 
 def build_geometry(

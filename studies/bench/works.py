@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.metrics import METRICS as ALL
+from jaxmodel.numbers import in_working_precision
 from jaxmodel.simulate import RunResult
 from studies import config
 from studies.engine.executor import Executor
@@ -21,7 +22,7 @@ from studies.errors import StudyError, field_error
 from studies.kernels.compilation import compiler_time
 from studies.kernels.llvm import is_available
 from studies.reference.tables import BARE
-from studies.study.cases import build_cases, build_structure, in_working_precision
+from studies.study.cases import build_cases, build_structure
 from studies.study.spec import paper_study
 
 #: Workloads of closed-loop runs, 0.8 s at 10 kHz, by their differences from the paper's study.

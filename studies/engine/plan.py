@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxmodel.beam import BASES
 from jaxmodel.case import Case, Structure
+from jaxmodel.numbers import OF_STRUCTURE, case_of, in_working_precision
 from jaxmodel.prepare import COUPLED_STEP_LIMIT, STIFFNESS_LIMIT, coupled_rate, drive_rate
 from studies.config import processor
 from studies.engine.preflight import SUBSTEP_LIMIT, mechanics_at, step_counts
@@ -22,7 +23,9 @@ from studies.errors import StudyError
 from studies.kernels.cpu import LANE_BYTES
 from studies.kernels.gpu import BLOCK
 from studies.space.table import CaseTable, loose_study
-from studies.study.cases import build_cases, build_structure, in_working_precision
+from studies.study.cases import build_structure
+from studies.study.fields import Columns
+from studies.study.numbers import study_numbers
 from studies.threads import serial_blas
 
 #: Fields that change the program; each combination of their values is compiled separately.
@@ -175,9 +178,9 @@ def _accumulated(table: CaseTable, kept: tuple[str, ...]) -> tuple[str, ...]:
 
 def _structure(table: CaseTable, members: np.ndarray) -> Structure:
     """Sizes of the largest case, choices of all of them."""
-
-    columns = {name: column[members] for name, column in table.fields.items()}
-    return build_structure(loose_study(table, int(members[0])), columns)
+    columns = {x: column[members] for x, column in table.fields.items() if x in OF_STRUCTURE}
+    shared = loose_study(table, int(members[0]), (*STATIC, "patches.centers"))
+    return build_structure(shared, columns)
 
 
 def chunk_cases(table: CaseTable, rows: np.ndarray, structure: Structure, size: int) -> Case:
@@ -196,7 +199,11 @@ def chunk_cases(table: CaseTable, rows: np.ndarray, structure: Structure, size: 
     columns = {name: column[filled] for name, column in table.fields.items()}
     # ids, and seeds from them, take as long as all else here
     columns["run.seed"] = table.seed[filled] if structure.has_noise else np.zeros(size, np.int64)
-    return in_working_precision(build_cases(table.study, columns, structure))
+    return in_working_precision(_cases(table, columns, structure))
+
+
+def _cases(table: CaseTable, columns: Columns, structure: Structure) -> Case:
+    return case_of(structure, study_numbers(table.study, structure, columns))
 
 
 @kept_jit(static_argnums=0)
@@ -249,7 +256,7 @@ def _of_cases(
 ) -> np.ndarray:
     """A rate of each case [1/s], (m,), that depends on columns with these beginnings alone."""
     columns = {n: c[members] for n, c in table.fields.items() if n.startswith(names)}
-    case = build_cases(table.study, columns, structure)
+    case = _cases(table, columns, structure)
     is_many = [len(leaf) > 1 for leaf in jax.tree.leaves(case)]
     if not any(is_many):
         return np.full(len(members), float(rate(jax.tree.map(lambda x: x[0], case))))

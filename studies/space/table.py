@@ -310,7 +310,7 @@ def case_study(table: CaseTable, index: int) -> Study:
     Raises:
         StudyError: the case is not valid as a single study (its status says so too).
     """
-    data = loose_study(table, index).model_dump()
+    data = loose_study(table, index, table.fields).model_dump()
     data["run"]["seed"] = int(table.seed[index])
     modes = data["control"]["modes"]  # a mask of all cases can name more than this one has
     data["control"]["mode_mask"] = tuple(row[:modes] for row in data["control"]["mode_mask"])
@@ -318,11 +318,11 @@ def case_study(table: CaseTable, index: int) -> Study:
     return parse_study(data)
 
 
-def loose_study(table: CaseTable, index: int) -> Study:
-    """The study of one case, whether or not its fields fit together."""
+def loose_study(table: CaseTable, index: int, names: Iterable[str]) -> Study:
+    """The study with some fields of one case, whether or not these fit together."""
     study = table.study
-    for name, column in table.fields.items():
-        data = set_value(study, name, as_python(column[index]))
+    for name in table.fields.keys() & {*names}:
+        data = set_value(study, name, as_python(table.fields[name][index]))
         study = Study.model_construct(**dict(_sections(data)))
     return study
 

@@ -6,11 +6,10 @@ from functools import partial
 from typing import TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.numbers import case_of, is_used, structure_of
+from jaxmodel.numbers import case_of, in_working_precision, is_used, structure_of
 from studies.study.consistency import patch_centers
 from studies.study.fields import Columns, Fields
 from studies.study.numbers import one_study, study_numbers
@@ -55,17 +54,6 @@ def build_cases(study: Study, columns: Columns, structure: Structure) -> Case:
         Case whose leaves have a leading axis: the cases, or of length 1 where they do not differ.
     """
     return case_of(structure, study_numbers(study, structure, columns))
-
-
-def in_working_precision(cases: Tree) -> Tree:
-    """NumPy leaves in JAX's working precision (integers stay integers)."""
-    real = np.dtype(jnp.result_type(float))
-
-    def cast(x: np.ndarray) -> np.ndarray:
-        return x if np.issubdtype(x.dtype, np.integer) else x.astype(real)
-
-    changed: Tree = jax.tree.map(cast, cases)
-    return changed
 
 
 def as_arrays(case: Tree) -> Tree:

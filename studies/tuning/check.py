@@ -13,6 +13,7 @@ import scipy
 
 from jaxmodel import status
 from jaxmodel.case import Case, Structure
+from jaxmodel.numbers import in_working_precision
 from jaxmodel.simulate import RunResult
 from studies.engine.executor import Executor
 from studies.engine.plan import even_layout
@@ -20,7 +21,7 @@ from studies.engine.poles import PoleReport, pole_report, tracked_modes
 from studies.engine.preflight import check_run
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
-from studies.study.cases import build_cases, build_structure, in_working_precision
+from studies.study.cases import build_cases, build_structure
 from studies.study.numbers import one_study, study_numbers
 from studies.study.paths import Parts, parts_of, set_values
 from studies.study.spec import Study, parse_study

@@ -15,12 +15,13 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.case import Structure
+from jaxmodel.numbers import in_working_precision
 from studies.config import processor
 from studies.engine.executor import Differentiated, Executor
 from studies.engine.plan import Layout, even_layout, lane_unit
 from studies.engine.preflight import check_run
 from studies.errors import StudyError
-from studies.study.cases import build_structure, in_working_precision
+from studies.study.cases import build_structure
 from studies.study.numbers import study_numbers
 from studies.study.paths import Parts
 from studies.tuning.linear_fidelity import LinearFidelity, LoopEvaluation

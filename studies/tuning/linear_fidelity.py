@@ -16,12 +16,12 @@ import numpy as np
 
 from jaxmodel.case import Structure
 from jaxmodel.loop_figures import MARGINS, PEAKS
-from jaxmodel.numbers import Numbers
+from jaxmodel.numbers import Numbers, in_working_precision
 from jaxmodel.parameters import Array
 from studies.engine.plan import in_parts
 from studies.engine.robustness import find_margins
 from studies.errors import StudyError
-from studies.study.cases import build_structure, in_working_precision
+from studies.study.cases import build_structure
 from studies.study.numbers import stack_numbers, study_numbers
 from studies.tuning.loop_figures import (
     allowed_on,
