@@ -221,6 +221,7 @@ def own_loss(free):
     return 1e12 * jnp.sum(result.metrics.residual_rms**2)
 
 
+@pytest.mark.long  # in short: tests of gradients, and the derivatives of batched studies
 def test_gradients_and_hessians_of_an_own_loss():
     loss, free = jax.jit(own_loss), np.array([0.8, 0.9, 0.9, 1, 0.3, 1, 0.3, 1, 0.3])
     slope = jax.jit(jax.grad(own_loss))(free)
@@ -269,6 +270,7 @@ def test_a_batch_on_four_devices_is_that_on_one():
 FUNCTIONS = [x for x in jaxmodel.__all__ if inspect.isfunction(getattr(jaxmodel, x))]
 
 
+@pytest.mark.long  # in short: their functions have tests of their own
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_every_public_function_has_an_example_that_runs(name):
     one = getattr(jaxmodel, name)
