@@ -94,16 +94,18 @@ def paper_case(
 
 
 def paper_machine() -> Machine:
-    """The paper's 3-PRR manipulator, whose links keep their length.
+    """The paper's 3-PRR manipulator, whose links keep their length; one number for equal ones.
 
     Values not given in the paper (E, density, width, I_p, damping, PZT permittivity and density)
     are the estimates listed in docs/theory.md.
 
     Example:
-        >>> paper_machine().beam.length.tolist()
-        [0.2, 0.2, 0.2]
+        >>> float(paper_machine().beam.length)
+        0.2
     """
-    return paper_case({"link.stretch": False})[1].machine
+    machine = paper_case({"link.stretch": False})[1].machine
+    equal: Machine = jax.tree.map(lambda x: x if np.ptp(x) else x.flat[0], machine)
+    return equal._replace(damping=machine.damping)
 
 
 def _size(numbers: Numbers, name: str, argument: str) -> int:

@@ -56,7 +56,6 @@ def fitted_into(spec: FitSpec, job: Job, has_pdf: bool = False) -> Fitted:
             (staging / TUNE).write_text(_tuning(fitted), encoding="utf-8")
             write_store(staging / DATA, fit_variables(fitted), run_attributes(fitted.study))
             write_report(fitted.report(), staging, has_pdf)
-            (staging / REPORT).unlink()  # which is to come, with more
         fitted = suggest(fitted, job)
         with publish(out) as staging:  # only now is there a document: the answer is complete
             (staging / REPORT).write_text(page(fitted.report(), out), encoding="utf-8")

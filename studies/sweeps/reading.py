@@ -139,10 +139,8 @@ def plot(
     name = "".join(f"{word}{part}" for word, part in parts if part)
     path = Path(out or Path(what) / f"{re.sub(_NO_NAME, '_', name).strip('_')}.png")
     save_plot(draw(data, x, y, hue), path)
-    written = f"written: {path}"
-    return Reading(
-        lambda: listed(left_out(data), written), lambda: Summary(name, [], True, [written])
-    )
+    said = f"written: {path}"
+    return Reading(lambda: listed(left_out(data), said), lambda: Summary(name, [], True, [said]))
 
 
 @verb

@@ -44,6 +44,7 @@ from studies.screen.run import PHASES, run_screen
 from studies.screen.shards import screen_of, table_of
 from studies.screen.workers import tallies_on
 from studies.sweeps.run import sweep_phases, swept_into
+from studies.sweeps.verb import sweep
 from studies.tuning.run import make_evaluator
 from studies.tuning.workers import ClusterEvaluator
 from tests.clusters import judged, machines
@@ -394,12 +395,9 @@ def test_workers_are_named_in_python_as_on_the_command_line(asked, place, named)
 
 
 @pytest.mark.parametrize("place", [2.0, True, [2]])
-def test_what_names_no_workers_is_refused(place):
-    with (
-        pytest.raises(StudyError, match="workers = .*; allowed: a number of processes"),
-        on_workers(place, 9.0, print),
-    ):
-        pass
+def test_what_names_no_workers_is_refused(place, tmp_path):
+    with pytest.raises(StudyError, match="--workers = .*; allowed: a number of processes"):
+        sweep("gains", tmp_path / "out", workers=place)
 
 
 @pytest.mark.parametrize(
