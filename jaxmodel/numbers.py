@@ -63,6 +63,7 @@ NO_TIME = 1e-12
 
 
 def is_used(field: str, values: np.ndarray) -> bool:
+    """Whether values of a field of `SWITCHES` need what it switches on."""
     if field in SWITCHES["has_poles"]:  # added damping of 0 specifies poles, too; NaN is none
         return bool(np.any(values >= 0))
     return bool(np.any(values != NEUTRAL.get(field, 0.0)))

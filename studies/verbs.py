@@ -58,6 +58,8 @@ def _check(name: str, value: Any, annotation: str) -> None:
         raise StudyError("--out: an empty name; name a file or a folder")
     if isinstance(value, float) and not math.isfinite(value):
         raise field_error(label, value, "a finite number")
+    if name == "worker_timeout" and not value > 0:
+        raise field_error(label, value, "more than 0", "s")
 
 
 def check_file(out: str | Path | None, *endings: str) -> None:

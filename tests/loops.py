@@ -12,7 +12,8 @@ from threadpoolctl import threadpool_limits
 
 from jaxmodel.case import Case, Structure
 from studies.engine.stability import _loops, gain_margin, with_margin_modes
-from studies.study.cases import build_cases, build_structure
+from studies.study.cases import build_structure
+from studies.study.numbers import build_cases
 from tests.canonical import MACHINE, study_of
 
 STUDY = study_of(MACHINE)

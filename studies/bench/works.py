@@ -22,7 +22,8 @@ from studies.errors import StudyError, field_error
 from studies.kernels.compilation import compiler_time
 from studies.kernels.llvm import is_available
 from studies.reference.tables import BARE
-from studies.study.cases import build_cases, build_structure
+from studies.study.cases import build_structure
+from studies.study.numbers import build_cases
 from studies.study.spec import paper_study
 
 #: Workloads of closed-loop runs, 0.8 s at 10 kHz, by their differences from the paper's study.

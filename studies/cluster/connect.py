@@ -115,8 +115,6 @@ def connected(
         StudyError: no extra `cluster`, no such scheduler, no worker, workers of other versions or
             without an answer, or the scheduler goes meanwhile.
     """
-    if not timeout > 0:
-        raise field_error("--worker-timeout", timeout, "more than 0", "s")
     try:
         import distributed  # noqa: F401
     except ImportError:

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxmodel.beam import BASES
 from jaxmodel.case import Case, Structure
-from jaxmodel.numbers import OF_STRUCTURE, case_of, in_working_precision
+from jaxmodel.numbers import OF_STRUCTURE, in_working_precision
 from jaxmodel.prepare import COUPLED_STEP_LIMIT, STIFFNESS_LIMIT, coupled_rate, drive_rate
 from studies.config import processor
 from studies.engine.preflight import SUBSTEP_LIMIT, mechanics_at, step_counts
@@ -24,8 +24,7 @@ from studies.kernels.cpu import LANE_BYTES
 from studies.kernels.gpu import BLOCK
 from studies.space.table import CaseTable, loose_study
 from studies.study.cases import build_structure
-from studies.study.fields import Columns
-from studies.study.numbers import study_numbers
+from studies.study.numbers import build_cases
 from studies.threads import serial_blas
 
 #: Fields that change the program; each combination of their values is compiled separately.
@@ -199,11 +198,7 @@ def chunk_cases(table: CaseTable, rows: np.ndarray, structure: Structure, size: 
     columns = {name: column[filled] for name, column in table.fields.items()}
     # ids, and seeds from them, take as long as all else here
     columns["run.seed"] = table.seed[filled] if structure.has_noise else np.zeros(size, np.int64)
-    return in_working_precision(_cases(table, columns, structure))
-
-
-def _cases(table: CaseTable, columns: Columns, structure: Structure) -> Case:
-    return case_of(structure, study_numbers(table.study, structure, columns))
+    return in_working_precision(build_cases(table.study, columns, structure))
 
 
 @kept_jit(static_argnums=0)
@@ -256,7 +251,7 @@ def _of_cases(
 ) -> np.ndarray:
     """A rate of each case [1/s], (m,), that depends on columns with these beginnings alone."""
     columns = {n: c[members] for n, c in table.fields.items() if n.startswith(names)}
-    case = _cases(table, columns, structure)
+    case = build_cases(table.study, columns, structure)
     is_many = [len(leaf) > 1 for leaf in jax.tree.leaves(case)]
     if not any(is_many):
         return np.full(len(members), float(rate(jax.tree.map(lambda x: x[0], case))))

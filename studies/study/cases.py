@@ -12,7 +12,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.numbers import case_of, in_working_precision, is_used, structure_of
 from studies.study.consistency import patch_centers
 from studies.study.fields import Columns, Fields
-from studies.study.numbers import one_study, study_numbers
+from studies.study.numbers import one_study
 from studies.study.paths import field_value
 from studies.study.spec import Study
 
@@ -32,28 +32,15 @@ def build_structure(study: Study, columns: Columns | None = None) -> Structure:
         "n_controlled": min(int(fields.numbers("control.modes").max()), n_patches),
         "n_patches": n_patches,
     }
-    is_needed = lambda name: is_used(name, fields.numbers(name))  # noqa: E731
-    return structure_of(partial(field_value, study), sizes, is_needed)
+    return structure_of(
+        partial(field_value, study), sizes, lambda name: is_used(name, fields.numbers(name))
+    )
 
 
 def build_case(study: Study) -> Case:
     """Traced part of a study, as NumPy numbers and arrays in SI units."""
     structure = build_structure(study)
     return case_of(structure, one_study(study, structure))
-
-
-def build_cases(study: Study, columns: Columns, structure: Structure) -> Case:
-    """Traced part of many studies that differ in some fields.
-
-    Args:
-        study: values of all fields that no column names.
-        columns: values of the others, one per case (see `studies.study.fields`).
-        structure: sizes; those of the largest case.
-
-    Returns:
-        Case whose leaves have a leading axis: the cases, or of length 1 where they do not differ.
-    """
-    return case_of(structure, study_numbers(study, structure, columns))
 
 
 def as_arrays(case: Tree) -> Tree:

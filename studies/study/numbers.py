@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodel.case import Structure
+from jaxmodel.case import Case, Structure
 from jaxmodel.laws.state_space import STATE_SPACE
-from jaxmodel.numbers import Numbers
+from jaxmodel.numbers import Numbers, case_of
 from studies.study.consistency import EACH_PATCH
 from studies.study.fields import Columns, Fields, nesting
 from studies.study.paths import Parts, all_fields, field_choices, own_fields, own_place, parse_entry
@@ -90,6 +90,20 @@ def study_numbers(study: Study, structure: Structure, columns: Columns | None = 
         system = system_of(study.state_space, structure.n_links, structure.n_patches)
         numbers["state_space"] = jax.tree.map(lambda x: np.asarray(x)[None], system)
     return numbers
+
+
+def build_cases(study: Study, columns: Columns, structure: Structure) -> Case:
+    """Traced part of many studies that differ in some fields.
+
+    Args:
+        study: values of all fields that no column names.
+        columns: values of the others, one per case (see `studies.study.fields`).
+        structure: sizes; those of the largest case.
+
+    Returns:
+        Case whose leaves have a leading axis: the cases, or of length 1 where they do not differ.
+    """
+    return case_of(structure, study_numbers(study, structure, columns))
 
 
 def one_study(study: Study, structure: Structure) -> Numbers:

@@ -49,7 +49,7 @@ def sweep(
     Example:
         >>> sweep("gains", "gains").best("residual_rms")  # doctest: +SKIP
     """
-    from studies.errors import StudyError, field_error
+    from studies.errors import StudyError
     from studies.job import again, checked_out, working
     from studies.publish import EXPLORER, REPORT
     from studies.result import in_folder
@@ -60,8 +60,6 @@ def sweep(
     from studies.sweeps.say import write_sweep_report
 
     spec = as_given(what, SweepSpec, load_sweep)
-    if not worker_timeout > 0:
-        raise field_error("--worker-timeout", worker_timeout, "more than 0", "s")
     if dry_run:
         if resume and out is None:
             raise StudyError("--resume: name the folder with --out")

@@ -21,8 +21,8 @@ from studies.engine.poles import PoleReport, pole_report, tracked_modes
 from studies.engine.preflight import check_run
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
-from studies.study.cases import build_cases, build_structure
-from studies.study.numbers import one_study, study_numbers
+from studies.study.cases import build_structure
+from studies.study.numbers import build_cases, one_study, study_numbers
 from studies.study.paths import Parts, parts_of, set_values
 from studies.study.spec import Study, parse_study
 from studies.tuning.evaluate import first_residual, tuned_structure

@@ -26,8 +26,9 @@ from studies.engine.eigenvalues import eigenvalues
 from studies.engine.programs import kept_jit
 from studies.engine.robustness import judge_robustness
 from studies.engine.stability import gain_margin
-from studies.study.cases import as_arrays, build_cases, build_structure
+from studies.study.cases import as_arrays, build_structure
 from studies.study.fields import Columns
+from studies.study.numbers import build_cases
 from studies.study.paths import parts_of
 from studies.study.spec import Study
 from studies.threads import serial_blas

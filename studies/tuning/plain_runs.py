@@ -10,7 +10,7 @@ from jaxmodel.numbers import in_working_precision
 from jaxmodel.simulate import RunResult
 from studies.engine.executor import Executor
 from studies.engine.plan import even_layout
-from studies.study.cases import build_cases
+from studies.study.numbers import build_cases
 from studies.tuning.scenarios import lane_columns
 from studies.tuning.spec import TuneSpec
 

@@ -16,8 +16,8 @@ from jaxmodel.metrics import METRICS
 from studies.engine.frame import frame_of
 from studies.engine.preflight import check_run
 from studies.show.units import number, readable
-from studies.study.cases import build_cases
 from studies.study.entries import parse_entries
+from studies.study.numbers import build_cases
 from studies.study.resolution import is_deflection, least_step, resolution_text
 from studies.study.spec import Study
 from studies.tuning.check import JudgedDesign, PartRuns, judge

@@ -9,8 +9,9 @@ import scipy
 
 from studies.engine.chunks import distinct_loops
 from studies.show.units import count_text
-from studies.study.cases import build_cases, build_structure
+from studies.study.cases import build_structure
 from studies.study.fields import Columns, column_of
+from studies.study.numbers import build_cases
 from studies.study.paths import as_list, as_tuples, known_field, set_values
 from studies.study.spec import Study, parse_study
 from studies.tuning.spec import Family, TuneSpec, others

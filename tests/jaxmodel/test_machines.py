@@ -27,7 +27,8 @@ from studies.show.figures import styled
 from studies.show.sketch import link_parts, sketch, standing
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table
-from studies.study.cases import as_arrays, build_case, build_cases, build_structure
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.numbers import build_cases
 from studies.study.paths import EACH_LINK, field_value
 from studies.study.spec import load_study
 from studies.study.template import study_template

@@ -20,7 +20,8 @@ from studies.engine.margins import judge_loops
 from studies.engine.programs import kept_jit
 from studies.engine.stability import loop_report
 from studies.fitting.bench import Bench, response
-from studies.study.cases import as_arrays, build_case, build_cases, build_structure
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.numbers import build_cases
 from studies.study.signals import INPUTS, OUTPUTS, Signal, parse_signal
 from tests.bare import paper_study
 

@@ -8,7 +8,8 @@ from studies.engine.preflight import check_run
 from studies.errors import StudyError
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table
-from studies.study.cases import build_case, build_cases, build_structure
+from studies.study.cases import build_case, build_structure
+from studies.study.numbers import build_cases
 from studies.study.spec import Study
 from studies.study.window import (
     SETTLED,

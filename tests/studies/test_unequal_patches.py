@@ -21,9 +21,9 @@ from studies.space.free import join_numbers, plain_numbers
 from studies.space.table import build_table
 from studies.spillover.plants import LoopBuilder, PlantVariant, pad_channels
 from studies.spillover.proofs import SINES, collect
-from studies.study.cases import as_arrays, build_case, build_cases, build_structure
+from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.fields import column_of
-from studies.study.numbers import one_study
+from studies.study.numbers import build_cases, one_study
 from studies.study.paths import as_list
 from studies.study.section import MACHINE
 from studies.study.spec import parse_study

@@ -14,7 +14,8 @@ from studies.engine import function
 from studies.engine.executor import CaseLeaves, Differentiated, Executor
 from studies.engine.plan import Layout
 from studies.engine.runs import _simulate
-from studies.study.cases import as_arrays, build_case, build_cases, build_structure
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.numbers import build_cases
 from tests.bare import paper_study
 
 N_CASES = 16

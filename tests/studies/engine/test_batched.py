@@ -18,7 +18,8 @@ from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.kernels import bridge, native
 from studies.kernels.traced import InputLeaf, trace_loop
-from studies.study.cases import as_arrays, build_case, build_cases, build_structure
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.numbers import build_cases
 from tests.canonical import TINY, study_of
 
 #: One mode and one patch, which make small programs.

@@ -31,7 +31,8 @@ from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.results import read_sweep
 from studies.engine.stability import loop_report, with_margin_modes
 from studies.space.table import build_table
-from studies.study.cases import as_arrays, build_case, build_cases, build_structure
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.numbers import build_cases
 from studies.sweeps.show import ranked_cases
 from tests.bare import parse_sweep
 from tests.canonical import MACHINE, study_of

@@ -34,7 +34,8 @@ from studies.engine.robustness import (
 )
 from studies.engine.stability import _loops, with_margin_modes
 from studies.errors import StudyError
-from studies.study.cases import as_arrays, build_case, build_cases, build_structure
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.numbers import build_cases
 from studies.sweeps.show import ranked_cases
 from studies.tuning import loop_figures
 from studies.tuning.check import tuned_study

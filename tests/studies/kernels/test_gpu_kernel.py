@@ -26,7 +26,8 @@ from studies.engine.steps import kernel_steps
 from studies.kernels import bridge, gpu, llvm, native
 from studies.kernels.differentiable import DifferentiableLoop
 from studies.kernels.traced import InputLeaf, trace_loop
-from studies.study.cases import build_cases, build_structure
+from studies.study.cases import build_structure
+from studies.study.numbers import build_cases
 from tests.bare import paper_study
 from tests.studies.kernels.test_kernel import check_equal, every_operation, smallest
 

@@ -20,7 +20,8 @@ from studies.kernels import compilation, cpu, llvm, native
 from studies.kernels.compilation import ObjectCache
 from studies.kernels.traced import InputLeaf, trace_loop
 from studies.space.table import build_table
-from studies.study.cases import build_cases, build_structure
+from studies.study.cases import build_structure
+from studies.study.numbers import build_cases
 from tests.bare import paper_study
 from tests.canonical import HOME, study_of
 from tests.sweeps import MIXED, small_spec

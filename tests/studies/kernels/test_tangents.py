@@ -14,7 +14,8 @@ from studies.kernels.cpu import build_kernel
 from studies.kernels.derivatives import push_forward
 from studies.kernels.graph import Graph, objects
 from studies.kernels.traced import InputLeaf, trace_loop
-from studies.study.cases import build_cases, build_structure
+from studies.study.cases import build_structure
+from studies.study.numbers import build_cases
 from tests.bare import paper_study
 from tests.studies.kernels.test_kernel import every_operation, translated
 

@@ -60,7 +60,8 @@ from studies.laws.tuning import (
 from studies.laws.verb import compare
 from studies.results.labelled import plain
 from studies.space.table import build_table
-from studies.study.cases import build_cases, build_structure
+from studies.study.cases import build_structure
+from studies.study.numbers import build_cases
 from studies.study.spec import Study
 from studies.study.window import with_window
 from studies.tuning.optimise import _fresh_progress

@@ -14,9 +14,9 @@ from studies.errors import StudyError
 from studies.space.methods import morris_points, saltelli_points
 from studies.space.spec import load_sweep
 from studies.space.table import build_table, case_study
-from studies.study.cases import as_arrays, build_case, build_cases, build_structure
+from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.fields import Fields, padded
-from studies.study.numbers import study_numbers
+from studies.study.numbers import build_cases, study_numbers
 from tests.bare import parse_sweep
 from tests.canonical import MACHINE
 from tests.sweeps import BASE, MIXED, run_sweep, small, small_spec
