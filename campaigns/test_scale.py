@@ -14,7 +14,7 @@ import studies
 from studies.engine.folder import CHUNKS
 from studies.engine.results import read_sweep
 from studies.job import working
-from studies.screen.local import LocalScreener
+from studies.screen.local import tallies_here
 from studies.screen.run import PHASES, run_screen
 from studies.screen.shards import screen_of
 from studies.study.files import READY, read_toml
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.timeout(7200)  # the long ones, on a busy machine
 MIB = 2**20
 
 
-class Watched(LocalScreener):
+class Watched:
     """Notes memory, handles and threads after each shard."""
 
     def __init__(self):
@@ -34,7 +34,7 @@ class Watched(LocalScreener):
 
     def tallies(self, work):
         own = psutil.Process()
-        for answer in super().tallies(work):
+        for answer in tallies_here(work):
             note = own.memory_info().rss, own.num_fds(), own.num_threads()
             self.notes.append(note)
             yield answer
@@ -47,7 +47,7 @@ def test_shards_leave_nothing_behind(tmp_path):
     spec = small_spec({"method": "random", "count": 24 * 256, "axes": axes} | keep)
     watched = Watched()
     with working("sweep", tmp_path / "out", None, PHASES, progress=False) as job:
-        run_screen(screen_of(spec, 256), job, watched)
+        run_screen(screen_of(spec, 256), job, watched.tallies)
     memory, handles, threads = (np.array(x) for x in zip(*watched.notes, strict=True))
     assert len(memory) == 24
     assert handles[12:].max() <= handles[6:12].max()
