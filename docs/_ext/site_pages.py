@@ -9,6 +9,7 @@ from typing import Any
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
+from jupyter_cache import get_cache
 from reference import members_text
 from sphinx.application import Sphinx
 
@@ -25,6 +26,7 @@ def spread_notebooks(app: Sphinx, env: Any, names: list[str]) -> None:
     for k, name in enumerate(notebooks):
         others.insert(k * (step + 1), name)
     names[:] = others
+    get_cache(env.mystnb_config.execution_cache_path).get_cache_limit()  # or readers race for it
 
 
 def add_members(
