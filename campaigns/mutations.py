@@ -54,7 +54,8 @@ from studies.export.document import (
     to_json,
 )
 from studies.fitting.explore import explore_fit
-from studies.fitting.spec import FileEntry, load_fit
+from studies.fitting.kinds.entry import FileEntry
+from studies.fitting.spec import load_fit
 from studies.fitting.tables import column, read_columns
 from studies.job import locked_folder, working
 from studies.kernels import compilation

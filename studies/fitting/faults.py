@@ -12,8 +12,9 @@ import numpy as np
 from studies.errors import StudyError
 from studies.fitting.kinds.contract import Measurement
 from studies.fitting.kinds.modes import HeldModes, MachineModes
-from studies.fitting.kinds.response import ComplexResponse, Magnitude, Spectrum
-from studies.fitting.kinds.traces import Trace
+from studies.fitting.kinds.response import ComplexResponse, Magnitude
+from studies.fitting.kinds.spectrum import Spectrum
+from studies.fitting.kinds.trace import Trace
 from studies.study.signals import Signal
 
 #: A simple fault is as good as a more complicated one within this factor of chi square [1].

@@ -8,12 +8,20 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 
 from studies.engine.preflight import check_machine, check_run
 from studies.errors import StudyError, field_error, nearest, shown_name
+from studies.fitting.kinds.decay import DecayEntry
+from studies.fitting.kinds.entry import DataEntry, FileEntry, NoiseEntry, Percent, signal_sizes
+from studies.fitting.kinds.figures import FiguresEntry
+from studies.fitting.kinds.modes import ModesEntry
+from studies.fitting.kinds.response import RecordEntry, ResponseEntry
+from studies.fitting.kinds.settling import SettlingEntry
+from studies.fitting.kinds.spectrum import SpectrumEntry
+from studies.fitting.kinds.trace import TraceEntry
 from studies.show.units import headed, readable
 from studies.space.axes import Range
 from studies.space.free import (
@@ -22,17 +30,14 @@ from studies.space.free import (
     join_numbers,
     plain_numbers,
 )
-from studies.study.consistency import patch_centers
 from studies.study.explain import explain
 from studies.study.files import find_spec, read_toml
-from studies.study.links import OneALink
 from studies.study.paths import as_tuples, field_unit, parse_entry
 from studies.study.signals import INPUTS, OUTPUTS, Signal, parse_signal
 from studies.study.sizes import lengths
 from studies.study.spec import (
     DESIGN,
     MACHINE,
-    Pose,
     Section,
     Study,
     described,
@@ -40,218 +45,12 @@ from studies.study.spec import (
 )
 from studies.study.window import with_window
 
-Positive = Annotated[float, Field(ge=1e-30, le=1e12)]
-Percent = Annotated[float, Field(ge=1e-6, le=1000)]
-Share = Annotated[float, Field(ge=1e-6, lt=100)]
-
 #: Kinds of measurements that take a run of the whole motion.
 MOTIONS = ("trace", "settling", "figures")
 #: Fewer samples say nothing.
 FEWEST_SAMPLES = 20
-
-
-class Common(Section):
-    """Fields of every measurement."""
-
-    kind: str = described(..., "-", "kind of measurement")
-    name: str = described("", "-", "in messages and figures; default: its number", max_length=60)
-    check: bool = described(False, "-", "held out: compared, not fitted")
-
-
-#: What may be unknown of a response.
-Unknown = tuple[Literal["gain", "delay"], ...]
-
-
-class PoseEntry(Common):
-    """Fields of measurements at a pose."""
-
-    pose: Pose | None = described(None, "m; m; rad", "of the platform; default: first way-point")
-
-
-class ModesEntry(PoseEntry):
-    """Natural frequencies and damping ratios."""
-
-    frequency_hz: tuple[Positive, ...] = described(..., "Hz", "measured", min_length=1)
-    sigma_hz: Positive | tuple[Positive, ...] = described(
-        ..., "Hz", "standard deviation, of all or of each"
-    )
-    damping_ratio: tuple[Annotated[float, Field(ge=0, lt=1)], ...] = described(
-        (), "1", "measured; 0: not known"
-    )
-    damping_sigma: Positive | tuple[Positive, ...] | None = described(
-        None, "1", "standard deviation, of all or of each"
-    )
-    shapes: tuple[tuple[float, ...], ...] = described(
-        (), "-", "of each mode, the voltages of all sensors in any scale; they pair the modes"
-    )
-    ends: Literal["machine", "held"] = described(
-        "machine", "-", "the machine at the pose, or one link between held joints"
-    )
-    link: int = described(1, "1", "with ends = 'held'", ge=1, le=3)
-
-
-class OutputEntry(Common):
-    """Fields of measurements of one output."""
-
-    output: str = described(..., "-", "what is measured")
-
-
-class FileEntry(Common):
-    """Fields of measurements in a file of columns."""
-
-    file: str = described(..., "-", "CSV, HDF5, MATLAB or UFF, beside this file")
-
-
-class ThinnedEntry(OutputEntry, FileEntry):
-    """Fields of measurements whose rows can be thinned out."""
-
-    thin: int = described(
-        1,
-        "1",
-        "every how many rows one is kept, where noise is alike in neighbours",
-        ge=1,
-        le=10**6,
-    )
-
-
-class NoiseEntry(Section):
-    """Standard deviation of the values; both parts in quadrature."""
-
-    sigma: Positive | None = described(None, "unit of the output", "standard deviation")
-    sigma_percent: Percent | None = described(None, "%", "standard deviation over the value")
-
-
-class ShakenEntry(OutputEntry, FileEntry, PoseEntry):
-    """Fields of measurements of a machine that is shaken."""
-
-    input: str = described(..., "-", "what shakes the machine")
-    quantity: Literal["displacement", "velocity", "acceleration"] = described(
-        "displacement", "-", "of the output: as named, or its derivative; an accelerometer has none"
-    )
-
-
-class ResponseEntry(ShakenEntry, ThinnedEntry, NoiseEntry):
-    """A frequency response."""
-
-    frequency: str = described("frequency_hz", "-", "column")
-    real: str = described("real", "-", "column")
-    imag: str = described("imag", "-", "column")
-    magnitude: str = described("", "-", "column; instead of real and imaginary part")
-    unknown: Unknown = described((), "-", "of gain and delay, what nobody knows")
-
-
-class RecordEntry(ShakenEntry):
-    """Raw time records of an input and an output, which become a frequency response."""
-
-    time: str = described("time", "-", "column [s], evenly spaced")
-    source: str = described("input", "-", "column of the input")
-    value: str = described("output", "-", "column of the output")
-    segment_s: Positive = described(..., "s", "length of the segments that are averaged")
-    window: Literal["hann", "none"] = described(
-        "hann", "-", "of segments that overlap by half; none: each is an impact that has decayed"
-    )
-    estimator: Literal["H1", "H2"] = described(
-        "H1", "-", "H1: noise on the output; H2: noise on the input"
-    )
-    from_hz: float = described(0.0, "Hz", "lowest frequency that is kept", ge=0, le=1e5)
-    to_hz: float = described(
-        0.0, "Hz", "highest one; 0: 0.4 times the sample rate of the record", ge=0, le=1e5
-    )
-    unknown: Unknown = described((), "-", "of gain and delay, what nobody knows")
-    sigma_percent: Percent = described(
-        0.2, "%", "standard deviation over the value, beside what the coherence says"
-    )
-
-
-class DecayEntry(FileEntry, PoseEntry):
-    """Raw time records of a machine that rings or moves by chance, which become its modes."""
-
-    outputs: tuple[str, ...] = described(
-        ..., "-", "what is measured; several pair the modes by their shapes", min_length=1
-    )
-    time: str = described("time", "-", "column [s], evenly spaced")
-    values: tuple[str, ...] = described((), "-", "columns; default: named as the outputs")
-    quantity: Literal["displacement", "velocity", "acceleration"] = described(
-        "displacement",
-        "-",
-        "of the outputs: as named, or their derivatives; accelerometers have none",
-    )
-    excitation: Literal["none", "ambient"] = described(
-        "none", "-", "none: it is left to ring; ambient: chance shakes it all the time"
-    )
-    segment_s: float = described(
-        0.0, "s", "a decay each; ambient: length of the correlations; 0: as long as may be", ge=0
-    )
-    from_hz: float = described(0.0, "Hz", "lowest frequency of a mode", ge=0, le=1e5)
-    to_hz: float = described(
-        0.0, "Hz", "highest one; 0: 0.4 times the sample rate of the record", ge=0, le=1e5
-    )
-    sigma_percent: Percent = described(
-        1e-3, "%", "standard deviation of a pole over its size, beside what the scatter says"
-    )
-
-
-class SpectrumEntry(ShakenEntry, ThinnedEntry):
-    """A power spectrum under a white input of unknown strength."""
-
-    frequency: str = described("frequency_hz", "-", "column")
-    density: str = described("density", "-", "column, unit^2/Hz in any scale")
-    averages: int = described(1, "1", "independent spectra in the mean", ge=1, le=10**6)
-
-
-class TraceEntry(ThinnedEntry, NoiseEntry):
-    """A signal over time of the study's motion."""
-
-    time: str = described("time", "-", "column [s], from the start of the motion")
-    value: str = described("value", "-", "column")
-    unknown: tuple[Literal["gain", "offset"], ...] = described(
-        (), "-", "of gain and offset, what nobody knows"
-    )
-
-
-class SettlingEntry(OutputEntry):
-    """How long a signal takes to settle after the study's motion."""
-
-    time_s: float = described(
-        ...,
-        "s",
-        "from the end of the reference trajectory until it stays within the band",
-        ge=0,
-        le=1e4,
-    )
-    sigma_s: Positive = described(..., "s", "standard deviation")
-    band: Positive | None = described(None, "unit of the output", "to each side of 0")
-    band_percent: Share | None = described(
-        None, "%", "the same, over the largest value after the reference trajectory without control"
-    )
-    links: OneALink[bool] | None = described(
-        None, "-", "under control; default: those of the study"
-    )
-
-
-class FiguresEntry(Common, NoiseEntry):
-    """Metrics of the study's motion, or their reduction by control."""
-
-    values: dict[str, float] = described(
-        ..., "-", "metric = value, in its unit or in percent", min_length=1
-    )
-    of: Literal["controlled", "uncontrolled", "reduction"] = described(
-        "controlled", "-", "with control, without, or percent less with it"
-    )
-    amplitude: bool = described(
-        False, "-", "of the square root of the metric: an amplitude where it is a power"
-    )
-    take: Literal["rms", "largest"] = described("rms", "-", "of several entries of a metric")
-    modes: int | None = described(
-        None, "1", "controlled modes; default: those of the study", ge=1, le=12
-    )
-    links: OneALink[bool] | None = described(
-        None, "-", "under control; default: those of the study"
-    )
-
-
-#: Fields of each kind.
-ENTRIES: dict[str, type[Common]] = {
+#: What each kind's entry holds, and how it becomes a measurement.
+ENTRIES: dict[str, type[DataEntry]] = {
     "modes": ModesEntry,
     "response": ResponseEntry,
     "record": RecordEntry,
@@ -261,8 +60,6 @@ ENTRIES: dict[str, type[Common]] = {
     "settling": SettlingEntry,
     "figures": FiguresEntry,
 }
-
-
 #: What is measured without an input.
 MODES = "modes"
 #: What a next experiment is made with if nothing is said.
@@ -321,8 +118,7 @@ def own_signal(study: Study, name: str, end: str) -> Signal | None:
     """
     kinds = {"inputs": INPUTS, "outputs": OUTPUTS}[end]
     if " " in name:
-        n_patches, length = patch_centers(study).shape[1], study.each_link(study.link.length)
-        return parse_signal(name, kinds, n_patches, length, f"fit.next.{end}")
+        return parse_signal(name, kinds, *signal_sizes(study), f"fit.next.{end}")
     allowed = [
         *kinds,
         *([MODES] if end == "outputs" else []),
@@ -348,7 +144,7 @@ class FitSpec(NamedTuple):
     fit: Fit
     free: FreeNumbers
     priors: tuple[Prior, ...]
-    entries: tuple[Common, ...]
+    entries: tuple[DataEntry, ...]
     folder: Path  # where the files of the data are
     data: dict[str, Any]  # as read, for the record
 
@@ -478,7 +274,7 @@ def _prior(written: dict[str, Any], k: int, path: str, span: Range) -> Prior:
     return Prior(k, float(written["mean"]), float(written["sigma"]))
 
 
-def _entry(written: dict[str, Any], k: int, study: Study) -> Common:
+def _entry(written: dict[str, Any], k: int, study: Study) -> DataEntry:
     path = f"fit.data[{k}]"
     kind = written.get("kind")
     if not isinstance(kind, str) or kind not in ENTRIES:

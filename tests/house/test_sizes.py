@@ -72,7 +72,7 @@ OTHERS = {
     ),
     "studies/export/floating.py": (":3",),
     "studies/export/integers.py": ("np.zeros((3, *many, len(fixed.link)), np.int64)",),
-    "studies/fitting/kinds/traces.py": (":6", "np.arange(6)", "np.zeros(6)"),
+    "studies/fitting/kinds/settling.py": (":6", "np.arange(6)", "np.zeros(6)"),
     "studies/fitting/profiles.py": ("len(self.values) < 3",),
     "studies/job.py": (":3",),
     "studies/kernels/differentiable.py": ("3:",),

@@ -1,6 +1,6 @@
-"""Kinds of measurements: how the model predicts them, with derivatives by the parameters.
+"""Kinds of measurements, a file each: its entry, how that becomes data, and what predicts them.
 
-`contract` says what a kind does: `modes`, `response` and spectra on the linear machine, `runs` for
-signals and figures of whole motions. To add one, write a class with `residual` here, its fields in
-`studies.fitting.spec`, and make it in `studies.fitting.entries`.
+`contract` says what a kind does, `entry` what all entries have: `modes`, `decay`, `response` and
+`spectrum` on the linear machine, `trace` and `settling` on its recorded motion, `figures` on
+`runs`. To add one, write such a file and name its entry in `studies.fitting.spec`.
 """

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from studies.fitting.decays import Diagram
+
+if TYPE_CHECKING:
+    from studies.fitting.kinds.entry import DataEntry
 
 
 class Residual(NamedTuple):
@@ -95,17 +98,14 @@ class Measurement(ABC):
     mean_square: float = 1.0  # of residuals that are noise [1]
     labels: tuple[str, ...] = ()  # of the numbers, with their units
 
-    def __init__(
-        self, name: str, is_checked: bool, measured: np.ndarray, sigma: np.ndarray
-    ) -> None:
+    def __init__(self, entry: DataEntry, measured: np.ndarray, sigma: np.ndarray) -> None:
         """
         Args:
-            name: in messages and figures.
-            is_checked: held out: not fitted, only compared.
+            entry: of the file.
             measured: (n,).
             sigma: standard deviations of the measured values, (n,).
         """
-        self.name, self.is_checked = name, is_checked
+        self.name, self.is_checked = entry.name, entry.check
         self.measured, self.sigma = measured, sigma
 
     @abstractmethod

@@ -8,16 +8,22 @@ from __future__ import annotations
 
 import copy
 from abc import abstractmethod
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 import scipy
+from pydantic import Field
 
 from studies.errors import StudyError, field_error
 from studies.fitting.bench import Bench, Modes, PlantAt, Pose
 from studies.fitting.decays import Diagram
 from studies.fitting.kinds.contract import Measurement, Numbers
+from studies.fitting.kinds.entry import DataEntry, Models, PoseEntry, Positive, each
 from studies.study.signals import Signal, signal_name
+from studies.study.spec import described
+
+if TYPE_CHECKING:
+    from studies.fitting.spec import FitSpec
 
 #: Modes closer than this share one subspace [1].
 NEAR = 0.03
@@ -25,7 +31,78 @@ NEAR = 0.03
 ALIKE = 0.5
 #: Modes closer than this are one: their shapes are any of a subspace [1].
 EQUAL = 1e-6
+#: Shapes whose largest voltage is below this have no direction [V].
+SMALLEST = 1e-100
 TWO_PI = 2 * np.pi
+
+
+class ModesEntry(PoseEntry):
+    """Natural frequencies and damping ratios."""
+
+    frequency_hz: tuple[Positive, ...] = described(..., "Hz", "measured", min_length=1)
+    sigma_hz: Positive | tuple[Positive, ...] = described(
+        ..., "Hz", "standard deviation, of all or of each"
+    )
+    damping_ratio: tuple[Annotated[float, Field(ge=0, lt=1)], ...] = described(
+        (), "1", "measured; 0: not known"
+    )
+    damping_sigma: Positive | tuple[Positive, ...] | None = described(
+        None, "1", "standard deviation, of all or of each"
+    )
+    shapes: tuple[tuple[float, ...], ...] = described(
+        (), "-", "of each mode, the voltages of all sensors in any scale; they pair the modes"
+    )
+    ends: Literal["machine", "held"] = described(
+        "machine", "-", "the machine at the pose, or one link between held joints"
+    )
+    link: int = described(1, "1", "with ends = 'held'", ge=1, le=3)
+
+    def measurement(self, spec: FitSpec, models: Models, path: str) -> Measurement:
+        bench, count = models.bench, len(self.frequency_hz)
+        for name, ends in (("link", "machine"), ("pose", "held")):
+            if name in self.model_fields_set and self.ends == ends:
+                raise StudyError(f"{path}.{name}: has no meaning with ends = {ends!r}")
+        if "damping_sigma" in self.model_fields_set and not self.damping_ratio:
+            raise StudyError(f"{path}.damping_sigma: has no meaning without damping_ratio")
+        # without shapes, modes are known by their order
+        if not self.shapes and list(self.frequency_hz) != sorted(self.frequency_hz):
+            allowed = "ascending frequencies where no shapes are given"
+            raise field_error(f"{path}.frequency_hz", self.frequency_hz, allowed, "Hz")
+        damping = sigma = None
+        if self.damping_ratio:
+            damping = each(self.damping_ratio, count, f"{path}.damping_ratio")
+            damping[damping == 0] = np.nan
+            if self.damping_sigma is None:
+                raise StudyError(f"{path}.damping_sigma: missing beside damping_ratio")
+            sigma = each(self.damping_sigma, count, f"{path}.damping_sigma")
+        measured = Measured(
+            frequency=np.array(self.frequency_hz),
+            sigma=each(self.sigma_hz, count, f"{path}.sigma_hz"),
+            damping=damping,
+            damping_sigma=sigma,
+            shapes=self._shapes(bench, path) if self.shapes else None,
+        )
+        if self.ends == "machine":
+            return MachineModes(self, bench, measured, self.at(spec.study))
+        if count > bench.structure.n_modes:
+            allowed = f"at most link.modes = {bench.structure.n_modes} frequencies"
+            raise field_error(f"{path}.frequency_hz", self.frequency_hz, allowed)
+        return HeldModes(self, bench, measured, self.link - 1)
+
+    def _shapes(self, bench: Bench, path: str) -> np.ndarray:
+        count, size = len(self.frequency_hz), bench.study.n_links * bench.n_patches
+        if self.ends == "held":
+            raise StudyError(f"{path}.shapes: allowed with ends = 'machine' only")
+        if len(self.shapes) != count or any(len(x) != size for x in self.shapes):
+            raise StudyError(
+                f"{path}.shapes: {len(self.shapes)} lists; allowed: {count} lists of {size} "
+                "voltages, link by link and patch by patch"
+            )
+        shapes = np.array(self.shapes, complex)
+        largest = np.abs(shapes).max(axis=1, keepdims=True)
+        if not np.all(largest > SMALLEST):
+            raise StudyError(f"{path}.shapes: one of them is zero")
+        return np.asarray(shapes / largest)
 
 
 class Measured(NamedTuple):
@@ -68,8 +145,8 @@ class _Modes(Measurement):
     kind = "modes"
     diagram: Diagram | None = None  # where they come from raw records
 
-    def __init__(self, name: str, is_checked: bool, bench: Bench, modes: Measured) -> None:
-        super().__init__(name, is_checked, modes.frequency, modes.sigma)
+    def __init__(self, entry: DataEntry, bench: Bench, modes: Measured) -> None:
+        super().__init__(entry, modes.frequency, modes.sigma)
         self._bench = bench
         self.use(modes)
 
@@ -146,10 +223,8 @@ class _Modes(Measurement):
 class HeldModes(_Modes):
     """Modes of one link between held joints, in their order."""
 
-    def __init__(
-        self, name: str, is_checked: bool, bench: Bench, modes: Measured, link: int
-    ) -> None:
-        super().__init__(name, is_checked, bench, modes)
+    def __init__(self, entry: DataEntry, bench: Bench, modes: Measured, link: int) -> None:
+        super().__init__(entry, bench, modes)
         self._link = link
 
     def model_modes(self, values: np.ndarray, has_slopes: bool) -> ModelModes:
@@ -173,8 +248,7 @@ class MachineModes(_Modes):
 
     def __init__(
         self,
-        name: str,
-        is_checked: bool,
+        entry: DataEntry,
         bench: Bench,
         modes: Measured,
         pose: Pose,
@@ -183,12 +257,12 @@ class MachineModes(_Modes):
     ) -> None:
         """
         Args:
-            name, is_checked, bench, modes: see `Measurement`.
+            entry, bench, modes: what is measured, and its model.
             pose: where.
             seen: what shapes are made of; None: the voltages of all sensors.
             diagram: of modes from raw records.
         """
-        super().__init__(name, is_checked, bench, modes)
+        super().__init__(entry, bench, modes)
         self._pose, self._seen, self.diagram = pose, seen, diagram
 
     @property
@@ -307,18 +381,3 @@ def _share(shape: np.ndarray, span: np.ndarray) -> float:
     """Share of a shape's square that lies in the span of others [1]."""
     q, _ = np.linalg.qr(span)
     return float(np.linalg.norm(q.conj().T @ shape) ** 2 / np.linalg.norm(shape) ** 2)
-
-
-def check_ascending(frequency: tuple[float, ...], has_shapes: bool, path: str) -> None:
-    """Without shapes, modes are known by their order.
-
-    Raises:
-        StudyError: not ascending.
-    """
-    if not has_shapes and list(frequency) != sorted(frequency):
-        raise field_error(
-            f"{path}.frequency_hz",
-            frequency,
-            "ascending frequencies where no shapes are given",
-            "Hz",
-        )

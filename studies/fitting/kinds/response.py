@@ -1,53 +1,166 @@
-"""Frequency responses, complex or magnitudes, and power spectra under white forces."""
+"""Frequency responses, complex or magnitudes, as such or from raw records."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import scipy
 
-from studies.fitting.bench import Bench, Pose, response
+from studies.errors import StudyError, field_error
+from studies.fitting.bench import Bench, response
+from studies.fitting.kinds import entry as common
 from studies.fitting.kinds.contract import Line, Measurement, Noise, Residual, scaled
+from studies.fitting.kinds.entry import (
+    Models,
+    NoiseEntry,
+    Percent,
+    Positive,
+    ShakenEntry,
+    ThinnedEntry,
+    ascending,
+    unit_of,
+)
 from studies.fitting.kinds.unknown import GAIN, Adjusted, adjusted, noise_error
-from studies.study.signals import Signal
+from studies.fitting.records import RecordSettings, recorded_response
+from studies.fitting.uff import Side
+from studies.study.signals import INPUTS
+from studies.study.spec import Study, described
+
+if TYPE_CHECKING:
+    from studies.fitting.spec import FitSpec
 
 TWO_PI = 2 * np.pi
 #: A measured response this many times the model's at the starting point has another unit [1].
 OTHER_UNIT = 100.0
+#: What may be unknown of a response.
+Unknown = tuple[Literal["gain", "delay"], ...]
 
 
-class _BenchMeasurement(Measurement):
+class FrequencyEntry(ShakenEntry, ThinnedEntry):
+    """Fields of what is measured over frequency."""
+
+    frequency: str = described("frequency_hz", "-", "column")
+
+    def checked(self, frequency: np.ndarray, path: str) -> np.ndarray:
+        """The column, if it can be one of frequencies."""
+        ascending(frequency, self.frequency, path)
+        if frequency[0] < 0 or frequency[-1] > 1e5:
+            raise StudyError(
+                f"{path}: frequencies from {frequency[0]:g} to {frequency[-1]:g}; allowed: "
+                "0 to 100000 [Hz]"
+            )
+        return frequency
+
+
+class ResponseEntry(FrequencyEntry, NoiseEntry):
+    """A frequency response."""
+
+    real: str = described("real", "-", "column")
+    imag: str = described("imag", "-", "column")
+    magnitude: str = described("", "-", "column; instead of real and imaginary part")
+    unknown: Unknown = described((), "-", "of gain and delay, what nobody knows")
+
+    def sides(self, study: Study, path: str) -> list[Side]:
+        unit = INPUTS[self.signals(study, path)[0].kind][1]
+        return [*super().sides(study, path), ("orddenom", f"{path}.input", self.input, unit)]
+
+    def measurement(self, spec: FitSpec, models: Models, path: str) -> Measurement:
+        read = self.reader(spec, path)
+        frequency = self.checked(read(self.frequency), path)
+        if self.magnitude:
+            if self.unknown:
+                raise StudyError(f"{path}.unknown: has no meaning for a magnitude")
+            measured = read(self.magnitude)
+            if np.any(measured < 0):
+                raise StudyError(
+                    f"{path}: column {self.magnitude!r} has negative magnitudes; in dB?"
+                )
+        elif self.file.lower().partition("::")[0].endswith((".uff", ".unv")):
+            measured = read("value", is_real=False).astype(complex)
+        else:
+            measured = read(self.real, is_real=False)
+            if not np.iscomplexobj(measured):
+                measured = measured + 1j * read(self.imag)
+        make = Magnitude if self.magnitude else ComplexResponse
+        noise = self.noise(measured, path)
+        return make(self, models.bench, frequency, measured, noise, path)
+
+
+class RecordEntry(ShakenEntry):
+    """Raw time records of an input and an output, which become a frequency response."""
+
+    time: str = described("time", "-", "column [s], evenly spaced")
+    source: str = described("input", "-", "column of the input")
+    value: str = described("output", "-", "column of the output")
+    segment_s: Positive = described(..., "s", "length of the segments that are averaged")
+    window: Literal["hann", "none"] = described(
+        "hann", "-", "of segments that overlap by half; none: each is an impact that has decayed"
+    )
+    estimator: Literal["H1", "H2"] = described(
+        "H1", "-", "H1: noise on the output; H2: noise on the input"
+    )
+    from_hz: float = described(0.0, "Hz", "lowest frequency that is kept", ge=0, le=1e5)
+    to_hz: float = described(
+        0.0, "Hz", "highest one; 0: 0.4 times the sample rate of the record", ge=0, le=1e5
+    )
+    unknown: Unknown = described((), "-", "of gain and delay, what nobody knows")
+    sigma_percent: Percent = described(
+        0.2, "%", "standard deviation over the value, beside what the coherence says"
+    )
+
+    def measurement(self, spec: FitSpec, models: Models, path: str) -> Measurement:
+        names = self.time, self.source, self.value
+        time, source, output = map(self.reader(spec, path), names)
+        settings = RecordSettings(
+            segment=self.segment_s,
+            has_window=self.window == "hann",
+            is_h2=self.estimator == "H2",
+            band=(self.from_hz, self.to_hz),
+        )
+        found = recorded_response(time, source, output, settings, path)
+        if len(found.frequency) > common.MOST_ROWS:
+            longest = self.segment_s * common.MOST_ROWS / len(found.frequency)
+            raise field_error(
+                f"{path}.segment_s",
+                self.segment_s,
+                f"up to {longest:.3g} for this band: a fit takes up to {common.MOST_ROWS} "
+                "frequencies",
+                "s",
+            )
+        noise = Noise(found.sigma, self.sigma_percent / 100)
+        return ComplexResponse(self, models.bench, found.frequency, found.value, noise, path)
+
+
+class BenchMeasurement(Measurement):
     """What responses and spectra share: one input, one output, one pose."""
 
     kind, is_ordered = "response", True
 
     def __init__(
         self,
-        name: str,
-        is_checked: bool,
+        entry: ShakenEntry,
         bench: Bench,
-        pose: Pose,
-        signals: tuple[Signal, Signal],
-        order: int,
         frequency: np.ndarray,
         measured: np.ndarray,
         noise: Noise,
-        unit: str,
+        path: str,
     ) -> None:
         """
         Args:
-            name, is_checked, bench, pose: of the measurement.
-            signals: input and output.
-            order: derivatives by time that the output has: 0, 1 or 2.
+            entry: of the file.
+            bench: the machine.
             frequency: [Hz], (f,).
             measured: (f,).
             noise: of the measured values.
-            unit: of the response.
+            path: of the entry, for messages.
         """
-        super().__init__(name, is_checked, measured, noise.sigma(measured))
-        self._bench, self._pose, self.signals, self._order = bench, pose, signals, order
-        self.frequency, self._noise, self._unit = frequency, noise, unit
+        super().__init__(entry, measured, noise.sigma(measured))
+        source, output = entry.signals(bench.study, path)
+        self.signals = source, output
+        self._bench, self._pose = bench, entry.at(bench.study)
+        self._order = entry.order(output, path)  # derivatives by time that the output has
+        self.frequency, self._noise = frequency, noise
+        self._unit = f"{unit_of(output, entry.quantity)}/{INPUTS[source.kind][1]}"
 
     @property
     def patches(self) -> tuple[int, int]:
@@ -88,13 +201,13 @@ class _BenchMeasurement(Measurement):
         )
 
 
-class ComplexResponse(_BenchMeasurement):
+class ComplexResponse(BenchMeasurement):
     """Real and imaginary part."""
 
-    def __init__(self, *arguments: Any, unknown: tuple[str, ...] = ()) -> None:
-        """Arguments: as above; unknown: of gain and delay."""
-        super().__init__(*arguments)
-        self.unknown, self.n_hidden = unknown, len(unknown)
+    def __init__(self, entry: ResponseEntry | RecordEntry, *arguments: Any) -> None:
+        super().__init__(entry, *arguments)
+        self.unknown = tuple(dict.fromkeys(entry.unknown))
+        self.n_hidden = len(self.unknown)
 
     def predict(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
         model, slope, _ = self._adjusted(values, has_slopes)
@@ -127,7 +240,7 @@ class ComplexResponse(_BenchMeasurement):
         return self._line(label, np.abs(self.measured), np.abs(model), values)
 
 
-class Magnitude(_BenchMeasurement):
+class Magnitude(BenchMeasurement):
     """Absolute value alone."""
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
@@ -142,56 +255,3 @@ class Magnitude(_BenchMeasurement):
     def compare(self, values: np.ndarray) -> Line:
         model, _ = self.predict(values, False)
         return self._line(f"magnitude [{self._unit}]", self.measured, np.abs(model), values)
-
-
-class Spectrum(_BenchMeasurement):
-    """Power spectrum of the output under a white input of unknown strength.
-
-    The mean of n periodograms is gamma distributed about the model's. Half the squared residuals
-    add up to its negative log likelihood (Whittle): r = sign(x - 1) sqrt(2 n (x - 1 - ln x)) with
-    x = measured/(strength model), the strength being the likeliest, mean(measured/model).
-    """
-
-    kind, n_hidden = "spectrum", 1  # the strength of the input
-
-    def __init__(self, averages: int, *arguments: Any) -> None:
-        """Arguments: n; and those of a response, with any noise."""
-        super().__init__(*arguments)
-        self._averages = averages
-        self.mean_square = float(
-            2 * averages * (np.log(averages) - scipy.special.digamma(averages))
-        )
-
-    def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
-        model, slope = self.predict(values, has_slopes)
-        weight, away = self._shares(np.abs(model) ** 2)
-        root = np.sqrt(self._averages) * _half_deviance(away)  # over x - 1
-        if slope is None:
-            return Residual(-away * root, None)
-        by = 2 * (slope / model[:, None]).real
-        return Residual(-away * root, (self._averages / root)[:, None] * (by - weight @ by))
-
-    def _shares(self, model: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of each frequency in the strength, and x - 1, (f,)."""
-        ratio = self.measured / model
-        return ratio / ratio.sum(), ratio / ratio.mean() - 1
-
-    def reweigh(self, values: np.ndarray) -> None:
-        pass  # its noise follows from the averages
-
-    def compare(self, values: np.ndarray) -> Line:
-        model = np.abs(self.predict(values, False)[0]) ** 2
-        level = np.mean(self.measured / model)
-        return self._line("power spectrum [any unit]", self.measured, level * model, values)
-
-    def sanity_error(self, values: np.ndarray) -> str:
-        return ""  # any strength will do
-
-
-def _half_deviance(e: np.ndarray) -> np.ndarray:
-    """sqrt(2 (e - ln(1 + e)))/|e|, 1 at 0."""
-    is_small = np.abs(e) < 1e-3
-    large = np.where(is_small, 1.0, e)
-    series = 1 - 2 * e / 3 + e**2 / 2 - 2 * e**3 / 5
-    whole = 2 * (large - np.log1p(large)) / large**2
-    return np.sqrt(np.where(is_small, series, whole))

@@ -169,7 +169,7 @@ def test_units_do_not_matter():
 def test_a_record_of_too_many_frequencies_is_refused(monkeypatch, short):
     spec = spec_of(short, SHORT)
     bench = make_bench(spec)
-    monkeypatch.setattr("studies.fitting.entries.common.MOST_ROWS", 50)
+    monkeypatch.setattr("studies.fitting.kinds.entry.MOST_ROWS", 50)
     with pytest.raises(StudyError, match="segment_s = 0.5; allowed: up to 0.225 for this band"):
         made(spec, bench)
 

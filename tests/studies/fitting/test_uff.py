@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from studies.errors import DataWarning, StudyError
-from studies.fitting.entries.common import reader
 from tests.fits import HAMMER, RESPONSE, SPECTRUM, TRACE, spec_of
 
 #: An acceleration over an excitation force, as a hammer test has it.
@@ -44,7 +43,7 @@ WITH_ZERO = [*RESPONSES, 0j]
 def read(folder, entry, *functions, name="value"):
     (folder / "a.uff").write_text("".join(functions))
     spec = spec_of(folder, entry | {"file": entry["file"].replace("response.csv", "a.uff")})
-    return reader(spec, spec.entries[0], "fit.data[0]")(name)
+    return spec.entries[0].reader(spec, "fit.data[0]")(name, is_real=False)
 
 
 def test_functions_of_other_types_are_skipped_and_named(tmp_path):

@@ -1,16 +1,22 @@
-"""Signals over the time of the study's motion, and how long they take to settle."""
+"""How long signals take to settle after the study's motion."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
-from studies.errors import StudyError
-from studies.fitting.kinds.contract import Line, Measurement, Noise
+from studies.errors import StudyError, field_error
+from studies.fitting.kinds.contract import Measurement
+from studies.fitting.kinds.entry import Models, OutputEntry, Positive
 from studies.fitting.kinds.motions import Motion, Recording
-from studies.fitting.kinds.unknown import Adjusted, adjusted, noise_error
-from studies.study.signals import Signal
+from studies.study.links import OneALink
+from studies.study.signals import OUTPUTS, Signal
+from studies.study.spec import described
+
+if TYPE_CHECKING:
+    from studies.fitting.spec import FitSpec
 
 #: A signal that moves less is at rest [its unit].
 STILL = 1e-15
@@ -18,85 +24,41 @@ STILL = 1e-15
 TINY = 1e-30
 
 
-class Trace(Measurement):
-    """One signal over time, compared at the times of the measurement."""
+class SettlingEntry(OutputEntry):
+    """How long a signal takes to settle after the study's motion."""
 
-    kind, is_ordered = "trace", True
+    time_s: float = described(
+        ...,
+        "s",
+        "from the end of the reference trajectory until it stays within the band",
+        ge=0,
+        le=1e4,
+    )
+    sigma_s: Positive = described(..., "s", "standard deviation")
+    band: Positive | None = described(None, "unit of the output", "to each side of 0")
+    band_percent: Annotated[float, Field(ge=1e-6, lt=100)] | None = described(
+        None, "%", "the same, over the largest value after the reference trajectory without control"
+    )
+    links: OneALink[bool] | None = described(
+        None, "-", "under control; default: those of the study"
+    )
 
-    def __init__(
-        self,
-        name: str,
-        is_checked: bool,
-        motion: Motion,
-        signal: Signal,
-        time: np.ndarray,
-        measured: np.ndarray,
-        noise: Noise,
-        unit: str,
-        unknown: tuple[str, ...] = (),
-    ) -> None:
-        """
-        Args:
-            name, is_checked: of the measurement.
-            motion: the run.
-            signal: the output.
-            time: [s], (n,), ascending and within the run.
-            measured: (n,).
-            noise: of the measured values.
-            unit: of the signal.
-            unknown: of gain and offset.
-        """
-        super().__init__(name, is_checked, measured, noise.sigma(measured))
-        self.unknown, self.n_hidden = unknown, len(unknown)
-        self._motion, self.signal, self._noise, self._unit = motion, signal, noise, unit
-        self.time = time
-        motion.add(signal)
-
-    @property
-    def patches(self) -> tuple[int, int]:
-        """Links, and pairs of patches on each."""
-        return self._motion.patches
-
-    def predict(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
-        model, slope, _ = self._adjusted(values, has_slopes)
-        return model, slope
-
-    def _adjusted(self, values: np.ndarray, has_slopes: bool) -> Adjusted:
-        run = self._motion.find(self.name, self.signal, values, has_slopes)
-        model, slope = np.interp(self.time, run.time, run.value), None
-        if run.slope is not None:
-            by = [np.interp(self.time, run.time, x) for x in run.slope.T]
-            slope = np.stack(by, axis=1)
-        return adjusted(self.unknown, model, slope, self.measured, self.sigma)
-
-    def found(self, values: np.ndarray) -> dict[str, float]:
-        return self._adjusted(values, False).found
-
-    def reweigh(self, values: np.ndarray) -> None:
-        self.sigma = self._noise.of_model(self.predict(values, False)[0], self.measured)
-
-    def compare(self, values: np.ndarray) -> Line:
-        return Line(
-            abscissa="time [s]",
-            ordinate=f"{self.signal.kind} [{self._unit}]",
-            x=self.time,
-            measured=self.measured,
-            model=self.predict(values, False)[0],
-            away=self.residual(values, False).value,
-            is_log=False,
-        )
-
-    def sanity_error(self, values: np.ndarray) -> str:
-        if self.unknown:
-            return noise_error(self.unknown, self.measured, self.sigma)
-        model = self.predict(values, False)[0]
-        ratio = float(np.ptp(self.measured) / max(np.ptp(model), 1e-300))
-        if 0.01 < ratio < 100:
-            return ""
-        return (
-            f"measured moves {ratio:.3g} times as far as the model at the starting point; expected "
-            f"{self._unit}: check the unit"
-        )
+    def measurement(self, spec: FitSpec, models: Models, path: str) -> Measurement:
+        if (self.band is None) == (self.band_percent is None):
+            raise StudyError(
+                f"{path}: give band [unit of the output] or band_percent [%], one of them"
+            )
+        (signal,), longest = self.signals(spec.study, path), spec.study.run.duration
+        if signal.kind in ("slider", "platform", "motor"):
+            forms = ", ".join(OUTPUTS[x][0] for x in ("sensor", "deflection"))
+            raise field_error(f"{path}.output", self.output, f"{forms}, which settle about 0")
+        if self.time_s > longest:
+            allowed = f"within the run, at most {longest:g} (run.duration)"
+            raise field_error(f"{path}.time_s", self.time_s, allowed, "s")
+        band = Band(self.band or 0.0, None)
+        if self.band_percent is not None:
+            band = Band(self.band_percent / 100, models.motions.uncontrolled())
+        return Settling(self, models.motions.of(self.links), signal, band)
 
 
 class Band(NamedTuple):
@@ -115,26 +77,15 @@ class Settling(Measurement):
 
     kind, labels = "settling", ("settling time [s]",)
 
-    def __init__(
-        self,
-        name: str,
-        is_checked: bool,
-        motion: Motion,
-        signal: Signal,
-        band: Band,
-        measured: float,
-        sigma: float,
-    ) -> None:
+    def __init__(self, entry: SettlingEntry, motion: Motion, signal: Signal, band: Band) -> None:
         """
         Args:
-            name, is_checked: of the measurement.
+            entry: of the file.
             motion: the run.
             signal: the output.
             band: of the output.
-            measured: [s].
-            sigma: standard deviation [s].
         """
-        super().__init__(name, is_checked, np.array([measured]), np.array([sigma]))
+        super().__init__(entry, np.array([entry.time_s]), np.array([entry.sigma_s]))
         self._motion, self._signal, self._band = motion, signal, band
         for run in (motion, band.without):
             if run is not None:
