@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from jaxmodel.case import Case, Structure
+from jaxmodel.checks import check_shape
 from jaxmodel.drives import DRIVES
 from jaxmodel.fields import fields
 from jaxmodel.laws import LAWS
@@ -22,6 +23,12 @@ from jaxmodel.numbers import OWN_DRIVES, OWN_LAWS, Numbers, case_of, is_used, st
 from jaxmodel.parameters import Array, Machine
 from jaxmodel.table import PartError
 
+#: Its number, or one a link, is that of mode 1; those of other fields are the same for all modes.
+OF_MODE_1 = "control.damping"
+#: Modes of a link that can be under control.
+_MOST_CONTROLLED = 12
+#: Stands for a value that is not given.
+PAPERS = object()
 #: One number for each patch, which follows the placement.
 _OF_PATCHES = ("patches.sensor_factor", "patches.actuator_factor")
 
@@ -36,13 +43,15 @@ def paper_case(
 
     Args:
         values: by the names of files, in their units, such as {"control.gain_factor": 0.5,
-            "patches.centers": centers, "shaper.kind": "zvd"}. One number stands for all of a list.
-            They may be traced, but for choices, switches and `run.duration`.
+            "patches.centers": centers, "shaper.kind": "zvd"}; docs/reference/fields.md lists them.
+            One number stands for all of a list, one list of places or of damping ratios for all
+            links. They may be traced, but for choices, switches and `run.duration`; with a traced
+            one out of its range, the run's status is not 0 and its metrics are NaN.
         n_modes, n_controlled: most modes of a link, and most under control; default: those of
             "link.modes" and "control.modes", which may be traced and fewer.
 
     Returns:
-        (structure, case): what is static, and a pytree.
+        Structure, which is static, and Case, a pytree.
 
     Raises:
         ValueError: no such field, or a value of a wrong shape, or out of range.
@@ -58,7 +67,7 @@ def paper_case(
     """
     given, numbers = dict(values or {}), dict[str, Any]()
     for name, field in fields().items():
-        numbers[name] = _number(name, field, given.get(name))
+        numbers[name] = _number(name, field, given.get(name, PAPERS))
 
     def value(name: str) -> Any:
         number = numbers[name]
@@ -77,18 +86,40 @@ def paper_case(
             name = f"{place}.{part.name}.{x.name}"
             own = {"value": [x.default] * links[0], "shape": links, "unit": x.unit}
             own |= {"allowed": f"{x.low:g} to {x.high:g}", "limits": {"ge": x.low, "le": x.high}}
-            numbers[name] = _number(name, own, given.get(name))
+            numbers[name] = _number(name, own, given.get(name, PAPERS))
     for name in given.keys() - numbers.keys():
         _refuse(name, numbers)
     n_patches = np.shape(numbers["patches.centers"])[-1]
-    for name in {*_OF_PATCHES} - given.keys():
-        numbers[name] = np.ones((*links, n_patches))
-    n_controlled = n_controlled or _size(numbers, "control.modes", "n_controlled")
+    for name in _OF_PATCHES:
+        factor = given.get(name, 1.0)
+        own = {
+            **fields()[name],
+            "value": [[1.0] * n_patches] * links[0],
+            "shape": (*links, n_patches),
+        }
+        numbers[name] = _number(name, own, factor)
+        check_shape(name, numbers[name], (*links, n_patches))
     sizes = {
-        "n_modes": n_modes or _size(numbers, "link.modes", "n_modes"),
-        "n_controlled": min(n_controlled, n_patches),
+        "n_modes": _size(numbers, "link.modes", "n_modes", n_modes),
+        "n_controlled": min(
+            _size(numbers, "control.modes", "n_controlled", n_controlled), n_patches
+        ),
         "n_patches": n_patches,
     }
+    # a case with a traced number that is not allowed has no length, and its status says so
+    is_fine = [
+        jnp.all(_is_allowed(fields().get(name, {}), x))
+        for name, x in given.items()
+        if isinstance(x, jax.core.Tracer)
+    ]
+    is_fine += [
+        numbers[name] <= sizes[size]
+        for name, size in (("link.modes", "n_modes"), ("control.modes", "n_controlled"))
+        if isinstance(numbers[name], jax.core.Tracer)
+    ]
+    if is_fine:
+        length = numbers["link.length"]
+        numbers["link.length"] = jnp.where(jnp.stack(is_fine).all(), length, jnp.nan)
     structure = structure_of(value, sizes, is_needed)
     return structure, case_of(structure, numbers)
 
@@ -108,49 +139,74 @@ def paper_machine() -> Machine:
     return equal._replace(damping=machine.damping)
 
 
-def _size(numbers: Numbers, name: str, argument: str) -> int:
-    if isinstance(numbers[name], jax.core.Tracer):
+def _size(numbers: Numbers, name: str, argument: str, most: int) -> int:
+    """The largest of a number of modes: as said, or its value."""
+    field, value = fields()[name], numbers[name]
+    if most:
+        _number(argument, field, most)
+    elif isinstance(value, jax.core.Tracer):
         raise PartError(f"{argument}: missing; expected the largest {name}, which is traced")
-    return int(np.max(numbers[name]))
+    if most and not isinstance(value, jax.core.Tracer) and value > most:
+        raise PartError(f"{name} = {value}; allowed: up to {argument} = {most}")
+    return int(most or value)
 
 
 def _number(name: str, field: dict[str, Any], value: Any) -> Array:
     """A field's array: a value in the shape that the field has, or the paper's."""
     own = np.array(field["value"], field.get("dtype", float)).reshape(field["shape"])
-    if value is None:
+    if value is PAPERS:
         return own
+    if isinstance(value, jax.core.Tracer):
+        if "choices" in field:
+            raise PartError(f"{name}: traced; expected a value that is known before")
+        return _shaped(name, field.get("of"), own.shape, value)
     if "choices" in field:
         if value not in field["choices"]:
             _refuse(value, field["choices"], f"{name} = ")
         return np.array(field["choices"].index(value))
     try:
-        is_traced = isinstance(value, jax.Array)
-        array = value if is_traced else np.asarray(value, own.dtype)
-    except (TypeError, ValueError):
-        raise PartError(f"{name} = {value!r}; allowed: {field['allowed']}") from None
-    _check_range(name, field, array)
-    if field.get("of") == "links" and np.ndim(array) == 1 and own.ndim == 2:  # one a link
-        array = array[:, None]
-    shape = own.shape
-    is_list = "of" in field and np.ndim(array) == own.ndim
-    try:
-        return array if is_list else (jnp if is_traced else np).broadcast_to(array, shape)
-    except ValueError:
-        wanted = f"{shape} or a number" if shape else "a number"
-        raise PartError(f"{name}: shape {np.shape(value)}; expected {wanted}") from None
-
-
-def _check_range(name: str, field: dict[str, Any], array: Array) -> None:
-    """Refuse numbers out of range; of traced ones nobody knows."""
-    if isinstance(array, jax.core.Tracer):
-        return
-    numbers = np.ravel(np.asarray(array))
-    is_fine = np.isfinite(numbers)
-    for sign, bound in field.get("limits", {}).items():
-        is_fine &= getattr(operator, sign)(numbers, bound)
-    if not is_fine.all():
+        array = np.asarray(value)
+    except ValueError:  # lists of unequal length
+        array = np.array(None)
+    if array.dtype.kind not in "biuf":
+        raise PartError(f"{name} = {value!r}; allowed: {field['allowed']}")
+    if not (is_fine := _is_allowed(field, array)).all():
         unit = f" [{field['unit']}]" if field["unit"] else ""
-        raise PartError(f"{name} = {numbers[~is_fine][0]:g}; allowed: {field['allowed']}{unit}")
+        raise PartError(f"{name} = {array[~is_fine].flat[0]:g}; allowed: {field['allowed']}{unit}")
+    return np.asarray(_shaped(name, field.get("of"), own.shape, array), own.dtype)
+
+
+def _shaped(name: str, of: str | None, own: tuple[int, ...], value: Any) -> Array:
+    """A value in the shape of a field's arrays; `of`: what its lists hold."""
+    shape, xp = np.shape(value), jnp if isinstance(value, jax.core.Tracer) else np
+    if len(own) > 1 and of != "entries":  # also of lists that the paper's run has not
+        own = (*fields()["link.length"]["shape"], *own[1:])
+    target = own
+    if of and len(shape) == len(own):  # as long as written
+        target = (shape[0], *own[1:]) if of == "entries" else (own[0], *shape[1:])
+    elif of == "each link":
+        value, target = value[..., None], (own[0], 1 if name == OF_MODE_1 else _MOST_CONTROLLED)
+    elif of == "all links" and shape:
+        target = (own[0], *shape)
+    is_flat = of in ("entries", "lists") and 0 < len(shape) < len(own)
+    try:
+        if not is_flat and (shape or np.prod(target)):
+            return xp.broadcast_to(value, target)
+    except ValueError:
+        pass
+    wanted = {None: own, "entries": ("n", *own[1:])}.get(of, (*own[:1], "n"))
+    listed = ", ".join(map(str, wanted)) + "," * (len(wanted) == 1)
+    allowed = f"({listed}) or a number" if own else "a number"
+    raise PartError(f"{name}: shape {shape}; expected {allowed}")
+
+
+def _is_allowed(field: dict[str, Any], array: Array) -> Array:
+    """Which numbers are finite, within a field's bounds and, if they must be, whole."""
+    is_fine = abs(array) < np.inf
+    for sign, bound in field.get("limits", {}).items():
+        is_fine &= getattr(operator, sign)(array, bound)
+    is_whole = field.get("is_whole") or field.get("dtype") == "int"
+    return is_fine & (array % 1 == 0) if is_whole else is_fine
 
 
 def _refuse(name: Any, allowed: Any, place: str = "") -> None:

@@ -9,7 +9,7 @@ from jaxmodel.checks import check_shape
 from jaxmodel.dynamics import accelerations, inverse_dynamics, modal_chain
 from jaxmodel.kinematics import inverse_kinematics
 from jaxmodel.lazy import compiled, jax, jnp
-from jaxmodel.linear import linearise, mass_and_stiffness, places_and_rates
+from jaxmodel.linear import known_pose, linearise, mass_and_stiffness, places_and_rates
 from jaxmodel.parameters import Array
 from jaxmodel.plant import Plant
 from jaxmodel.prepare import prepare
@@ -32,7 +32,8 @@ def equations_of_motion(
 
     Returns:
         M [kg and mixed], C [N s/m and mixed], K [N/m and mixed], (n, n) each, F [1 and m], (n, l),
-        V [N/V and N m/V], (n, l K).
+        V [N/V and N m/V], (n, l K). All NaN where the pose is out of reach or singular, or patches
+        overlap or leave their link.
 
     Example:
         >>> M, C, K, F, V = equations_of_motion(*paper_case({"link.modes": 2}), HOME)
@@ -42,7 +43,7 @@ def equations_of_motion(
     check_shape("pose", pose, (structure.n_pose,))
     free = structure._replace(feedback="none")
     loop = prepare(free, case).loop
-    pose = jnp.asarray(pose, loop.omega.dtype)
+    pose = known_pose(loop.plant, case, pose)
     plant = linearise(free, loop, pose, is_held=not has_drive)
     mass, stiffness = mass_and_stiffness(loop, pose, plant)
     _, rates = places_and_rates(plant)

@@ -8,20 +8,23 @@ stiffness of the links. Matrices come from forward-mode differentiation of the l
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxmodel import status
 from jaxmodel.axial import axial_force, held_coordinates
 from jaxmodel.case import MOTOR_ORDER, Case, Structure
 from jaxmodel.checks import check_shape
 from jaxmodel.drive import Reference, motor_force, settled_motors, slider_force
 from jaxmodel.drives import DRIVES
 from jaxmodel.dynamics import inverse_dynamics, kinetic_energy, modal_chain
-from jaxmodel.kinematics import close_chain
+from jaxmodel.kinematics import close_chain, path_status
 from jaxmodel.lazy import compiled, jax, jnp
 from jaxmodel.loop import Loop, PlantState, plant_rates
 from jaxmodel.parameters import Array, Complex, Num
+from jaxmodel.piezo import placement_faults
+from jaxmodel.plant import Plant
 
 
 class LinearPlant(NamedTuple):
@@ -338,3 +341,19 @@ def frequency_response(
         return output @ jnp.linalg.solve(2j * jnp.pi * f * eye - plant.state, source + 0j)
 
     return jax.vmap(at)(jnp.asarray(frequency))
+
+
+def known_pose(plant: Plant, case: Case, pose: Any) -> Array:
+    """A pose, or NaN, and with it all that follows, where no machine can be.
+
+    Out of reach, singular, or with patches that overlap or leave their link.
+
+    Args:
+        plant: the machine.
+        case: its numbers.
+        pose: of the platform, (p,).
+    """
+    pose = jnp.asarray(pose, plant.length.dtype)
+    is_off, is_overlapping = placement_faults(case.machine.patches, plant.length)
+    is_fine = (path_status(plant, pose[None])[0] == status.OK) & ~is_off & ~is_overlapping
+    return jnp.where(is_fine, pose, jnp.nan)

@@ -23,7 +23,7 @@ from jaxmodel.drives.contract import DriveState, resting_drive
 from jaxmodel.electronics import FASTEST
 from jaxmodel.exponential import exponential
 from jaxmodel.lazy import compiled, jax, jnp
-from jaxmodel.linear import LinearPlant, Moment, linearise, resting
+from jaxmodel.linear import LinearPlant, Moment, known_pose, linearise, resting
 from jaxmodel.loop import Loop
 from jaxmodel.parameters import Array, Int, Num
 from jaxmodel.prepare import prepare
@@ -75,7 +75,8 @@ def closed_loop(
         moment: motion and load at that pose; None: at rest under the case's steady load.
 
     Returns:
-        LoopMatrices.
+        LoopMatrices; NaN where the pose is out of reach or singular, or patches overlap or leave
+        their link.
 
     Example:
         >>> structure, case = paper_case({"link.modes": 2})
@@ -86,6 +87,7 @@ def closed_loop(
     check_shape("pose", pose, (structure.n_pose,))
     smooth = structure._replace(is_smooth=True, feedback="sampled")
     loop = prepare(smooth, case).loop
+    pose = known_pose(loop.plant, case, pose)
     law = loop.controller if law is None else law
     moment = resting(structure, case) if moment is None else moment
     return loop_matrices(structure, case, loop, law, pose, moment)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxmodel.checks import check_below
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array, Num
 from jaxmodel.table import Table
@@ -111,11 +112,20 @@ def ei(omega: Array, zeta: Array, tolerance: Array) -> Impulses:
         zeta: its damping ratio, in [0, 1) [1], shape ().
         tolerance: V, residual vibration accepted at omega, in [0, 1) [1], shape ().
 
+    Raises:
+        ValueError: a number out of its range, unless it is traced.
+
     Example:
         >>> impulses = ei(700.0, 0.01, 0.05)
         >>> len(impulses.amplitude), round(float(jnp.sum(impulses.amplitude)), 12)
         (3, 1.0)
     """
+    for name, value, low, high, unit in (
+        ("omega", omega, 1e-300, np.inf, "rad/s"),
+        ("zeta", zeta, 0.0, 1.0, "1"),
+        ("tolerance", tolerance, 0.0, 1.0, "1"),
+    ):
+        check_below(name, value, low, high, unit)
     tolerance = jnp.asarray(tolerance)
     outer = (1 + tolerance) / 4
     return Impulses(jnp.stack([outer, (1 - tolerance) / 2, outer]), _half_periods(3, omega, zeta))

@@ -27,7 +27,7 @@ from studies.fitting.spec import ENTRIES, Fit, Next
 from studies.space.spec import Block, Sweep
 from studies.study.cases import build_structure
 from studies.study.explain import allowed_values, unit_of
-from studies.study.numbers import one_study
+from studies.study.numbers import form_of, one_study
 from studies.study.paths import field_choices
 from studies.study.spec import OWN_FIELDS, Study, paper_study
 from studies.study.template import toml_value
@@ -281,6 +281,10 @@ LISTS += ("electronics.lowpass_ratio", "electronics.lowpass_zeta", "machine.join
 LISTS += ("shaper.frequencies_hz",)
 
 
+#: What a plain list is where one list a link may be: one for all, a number a link, nothing.
+_LISTS = {"list of links": "all links", "mode": "each link", "plain": "lists"}
+
+
 def model_fields() -> str:
     """`jaxmodel/fields.json`: the paper's value, unit and range of each number."""
     study = paper_study()
@@ -293,11 +297,13 @@ def model_fields() -> str:
         row["allowed"] = allowed_values(info.annotation, info.metadata)
         if array.dtype.kind == "i":
             row["dtype"] = "int"
+        if "true or false" in row["allowed"]:
+            row |= {"limits": {"ge": 0.0, "le": 1.0}, "is_whole": True}
         if choices:
             row["choices"] = choices
         if limits := _limits_of(info.annotation, info.metadata):
             row["limits"] = limits
-        of = "entries" if name in LISTS else "links" if array.ndim == 2 else ""
+        of = "entries" if name in LISTS else _LISTS.get(form_of(name), "") * (array.ndim == 2)
         found[name] = row | ({"of": of} if of else {})
     rows = (f" {json.dumps(name)}: {json.dumps(row)}" for name, row in found.items())
     return "{\n" + ",\n".join(rows) + "\n}\n"

@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -327,3 +328,11 @@ def test_the_table_of_what_is_left_out_is_what_its_script_prints():
     table = [row.split("|")[2:4] for row in section.split("\n\n")[2].splitlines()[2:]]
     written = [[float(cell.split()[0]) for cell in row] for row in table]
     np.testing.assert_allclose(written, list(zip(default, stubby, strict=True)), rtol=0.03)
+
+
+def test_every_type_of_the_reference_is_there():
+    text = (SITE / "reference" / "api.md").read_text(encoding="utf-8")
+    names = re.findall(r"autoclass:: (\S+)\.(\w+)", text)
+    assert len(names) > 30
+    missing = [name for module, name in names if not hasattr(import_module(module), name)]
+    assert not missing

@@ -134,7 +134,7 @@ class BlockFunction:
             return self._prepared(0, free, own, shared)
 
         def split(x: Any) -> Any:
-            return jnp.reshape(x, (-1, GROUP, *x.shape[1:]))
+            return jnp.reshape(x, (len(x) // GROUP, GROUP, *x.shape[1:]))  # also of empty lists
 
         def joined(x: Any) -> Any:
             return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], self.lanes)

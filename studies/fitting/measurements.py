@@ -6,8 +6,8 @@ import numpy as np
 
 from studies.fitting.bench import Bench
 from studies.fitting.experiment import check_candidates
-from studies.fitting.kinds.contract import Measurement
-from studies.fitting.kinds.entry import Models, PoseEntry, check_drive
+from studies.fitting.kinds.contract import Measurement, Models
+from studies.fitting.kinds.entry import PoseEntry, check_drive
 from studies.fitting.kinds.modes import ModesEntry
 from studies.fitting.kinds.motions import Motions
 from studies.fitting.kinds.runs import Runs
@@ -37,10 +37,14 @@ def make_measurements(spec: FitSpec, bench: Bench) -> list[Measurement]:
     """
     inputs, moving = (spec.study, spec.free.place), spec.free.fields
     motions = Motions(*inputs, _places(spec, True), moving)
-    models = Models(bench, Runs(*inputs, moving), motions)
-    return [
-        entry.measurement(spec, models, f"fit.data[{k}]") for k, entry in enumerate(spec.entries)
-    ]
+    models = Models(
+        study=spec.study,
+        folder=spec.folder,
+        bench=bench,
+        runs=Runs(*inputs, moving),
+        motions=motions,
+    )
+    return [x.measurement(models, f"fit.data[{k}]") for k, x in enumerate(spec.entries)]
 
 
 def _places(spec: FitSpec, of_motions: bool) -> tuple[float, ...]:

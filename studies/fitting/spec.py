@@ -14,8 +14,9 @@ from pydantic import ValidationError
 
 from studies.engine.preflight import check_machine, check_run
 from studies.errors import StudyError, field_error, nearest, shown_name
+from studies.fitting.kinds.contract import DataEntry
 from studies.fitting.kinds.decay import DecayEntry
-from studies.fitting.kinds.entry import DataEntry, FileEntry, NoiseEntry, Percent, signal_sizes
+from studies.fitting.kinds.entry import FileEntry, NoiseEntry, Percent, signal_sizes
 from studies.fitting.kinds.figures import FiguresEntry
 from studies.fitting.kinds.modes import ModesEntry
 from studies.fitting.kinds.response import RecordEntry, ResponseEntry

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.case import Case, Structure
+from jaxmodel.defaults import OF_MODE_1
 from jaxmodel.laws.state_space import STATE_SPACE
 from jaxmodel.numbers import Numbers, case_of
 from studies.study.consistency import EACH_PATCH
@@ -32,8 +33,6 @@ from studies.study.window import DELAY, residual_delay
 #: one entry a link, (l,); a list a link, (l, n); one entry for each controlled mode of each link,
 #: (l, C); a position among names; one entry a move, (n,), n = 1 if one stands for all.
 Form = Literal["plain", "integer", "choice", "link", "list of links", "mode", "move"]
-#: Its number, or one a link, is that of mode 1; those of other fields are the same for all modes.
-OF_MODE_1 = "control.damping"
 
 
 @cache

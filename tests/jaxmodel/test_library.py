@@ -16,6 +16,7 @@ import jaxmodel
 from jaxmodel import (
     HOME,
     closed_loop,
+    ei,
     equations_of_motion,
     linearise,
     lumped_forces,
@@ -23,6 +24,7 @@ from jaxmodel import (
     paper_case,
     prepare,
     simulate,
+    status,
 )
 from jaxmodel.dynamics import accelerations, modal_chain
 from jaxmodel.simulate import begin
@@ -67,6 +69,10 @@ def quick():
             "run.smooth": True,
         },
         {"link.length": 0.22, "motion.move_time": (0.1, 0.2, 0.1, 0.2), "shaper.kind": "zvd"},
+        {"patches.centers": (0.04, 0.1, 0.15), "control.pole_decay": (20.0, 30.0, 20.0)},
+        {"control.pole_decay": 20.0, "control.pole_frequency_hz": ((100.0,),) * 3},
+        {"control.pole_decay": ((20.0,),) * 3, "link.damping_ratio": (0.01, 0.02)},
+        {"control.damping": 0.1, "control.frequencies_hz": (90.0, 300.0)},
     ],
 )
 def test_a_case_is_that_of_a_file_with_the_same_numbers(values):
@@ -92,11 +98,70 @@ def test_a_case_is_that_of_a_file_with_the_same_numbers(values):
         ({"control.laws.ppf.damping_ratio": -1}, "no such field"),
         ({"shaper.kind": "eii"}, "shaper.kind = eii: no such choice; allowed: none, .*'ei'"),
         ({"control.law": "imcs"}, "control.law = imcs: no such choice.*'imsc'"),
+        ({"control.ratios": [1.0, 0.3, 0.1]}, r"ratios: shape \(3,\); expected \(3, n\)"),
+        ({"control.ratios": [[1.0, 0.3]] * 2}, r"ratios: shape \(2, 2\); expected \(3, n\)"),
+        ({"patches.centers": np.full((2, 3), 0.1)}, r"centers: shape \(2, 3\); expected \(3, n\)"),
+        (
+            {"patches.sensor_factor": [1.0, 1.0]},
+            r"sensor_factor: shape \(3, 2\); expected \(3, 3\)",
+        ),
+        ({"motion.waypoints": [[0.0, 0.0]]}, r"waypoints: shape \(1, 2\); expected \(n, 3\)"),
+        ({"shaper.frequencies_hz": 90.0}, r"frequencies_hz: shape \(\); expected \(n,\)"),
+        ({"control.links": [2, 1, 0]}, "control.links = 2; allowed: .* true or false"),
+        ({"link.modes": 2.5}, "link.modes = 2.5; allowed: a whole number"),
+        ({"link.modes": "2"}, "link.modes = '2'; allowed: a whole number"),
+        ({"control.gain_factor": None}, "gain_factor = None; allowed: a finite number"),
     ],
 )
 def test_wrong_numbers_are_refused(values, message):
     with pytest.raises(ValueError, match=message):
         paper_case(values)
+
+
+def test_counts_of_modes_are_checked():
+    for values, count, message in (
+        ({}, 40, "n_modes = 40; allowed: a whole number >= 1 and <= 16"),
+        ({"link.modes": 3}, 2, "link.modes = 3; allowed: up to n_modes = 2"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            paper_case(values, n_modes=count)
+
+
+def test_traced_numbers_that_are_not_allowed_give_a_status():
+    values = {
+        "link.modes": np.array([2, 40, 0, 3, 2, 2, 2]),
+        "control.gain_factor": np.array([0.5, 0.5, 0.5, -1, np.nan, 0.5, 0.5]),
+        "control.links": np.array([[1.0] * 3] * 5 + [[2.0, 1, 1], [0.0, 1, 1]]),
+    }
+
+    def run(values):
+        result = simulate(*paper_case(QUICK | values, n_modes=3, n_controlled=2))
+        return result.status, result.metrics.residual_rms
+
+    code, left = jax.jit(jax.vmap(run))(values)
+    is_fine = np.array([1, 0, 0, 0, 0, 0, 1], bool)
+    np.testing.assert_array_equal(np.asarray(code)[~is_fine], status.NON_FINITE)
+    np.testing.assert_array_equal(np.isfinite(left).all(axis=(1, 2)), is_fine)
+
+
+def test_no_machine_has_no_matrices(quick):
+    structure, case = quick
+    overlapping = paper_case(QUICK | {"patches.centers": (0.05, 0.06, 0.15)})
+    for given, pose in (
+        (quick, (0.0, 1.0, 0.5)),
+        (quick, (np.nan, 0.0, 0.5)),
+        (overlapping, HOME),
+    ):
+        found = equations_of_motion(*given, np.array(pose))
+        assert all(np.isnan(x).all() for x in found)
+        assert np.isnan(closed_loop(*given, np.array(pose)).state_space()[0]).any()
+
+
+@pytest.mark.parametrize("name, value", [("omega", -1.0), ("zeta", 1.0), ("tolerance", np.nan)])
+def test_a_shaper_says_which_number_is_wrong(name, value):
+    numbers = {"omega": 700.0, "zeta": 0.01, "tolerance": 0.05} | {name: value}
+    with pytest.raises(ValueError, match=f"{name} = {value:g}; allowed: "):
+        ei(**numbers)
 
 
 def test_what_must_be_known_before_is_not_traced():

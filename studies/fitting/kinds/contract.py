@@ -1,16 +1,19 @@
-"""What every kind of measurement does."""
+"""What every kind of measurement is: an entry of the file, and what it becomes."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from studies.fitting.bench import Bench
 from studies.fitting.decays import Diagram
-
-if TYPE_CHECKING:
-    from studies.fitting.kinds.entry import DataEntry
+from studies.fitting.kinds.motions import Motions
+from studies.fitting.kinds.runs import Runs
+from studies.study.signals import Signal
+from studies.study.spec import Section, Study, described
 
 
 class Residual(NamedTuple):
@@ -83,6 +86,40 @@ class Noise(NamedTuple):
         """The same of a model's values; of measured ones where the model is 0."""
         sigma = self.sigma(model)
         return np.where(sigma > 0, sigma, self.sigma(measured))
+
+
+class Models(NamedTuple):
+    """What measurements are predicted with."""
+
+    study: Study
+    folder: Path  # where the files of the data are
+    bench: Bench
+    runs: Runs
+    motions: Motions
+
+
+class DataEntry(Section):
+    """Fields of every measurement."""
+
+    kind: str = described(..., "-", "kind of measurement")
+    name: str = described("", "-", "in messages and figures; default: its number", max_length=60)
+    check: bool = described(False, "-", "held out: compared, not fitted")
+
+    def measurement(self, models: Models, path: str) -> Measurement:
+        """The measurement with its data.
+
+        Args:
+            models: what predicts it.
+            path: where the entry is written, for messages.
+
+        Raises:
+            StudyError: data that cannot be used, or do not fit the machine.
+        """
+        raise NotImplementedError
+
+    def signals(self, study: Study, path: str) -> tuple[Signal, ...]:
+        """Its input, if it has one, and its outputs."""
+        return ()
 
 
 class Measurement(ABC):

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from studies.errors import StudyError, field_error
 from studies.fitting.decays import DecaySettings, decay_modes
-from studies.fitting.kinds.contract import Measurement
+from studies.fitting.kinds.contract import Measurement, Models
 from studies.fitting.kinds.entry import (
     GIVEN,
     ORDERS,
     FileEntry,
-    Models,
     Percent,
     PoseEntry,
     Quantity,
@@ -22,9 +21,6 @@ from studies.fitting.kinds.entry import (
 from studies.fitting.kinds.modes import MachineModes, Measured, Seen
 from studies.study.signals import OUTPUTS, Signal, parse_signal
 from studies.study.spec import Study, described
-
-if TYPE_CHECKING:
-    from studies.fitting.spec import FitSpec
 
 
 class DecayEntry(FileEntry, PoseEntry):
@@ -62,8 +58,8 @@ class DecayEntry(FileEntry, PoseEntry):
             for j, x in enumerate(self.outputs)
         )
 
-    def measurement(self, spec: FitSpec, models: Models, path: str) -> Measurement:
-        read, signals = self.reader(spec, path), self.signals(spec.study, path)
+    def measurement(self, models: Models, path: str) -> Measurement:
+        read, signals = self.reader(models, path), self.signals(models.study, path)
         columns = self.values or self.outputs
         if len(columns) != len(signals):
             allowed = f"{len(signals)} columns, one of each output"
@@ -92,5 +88,5 @@ class DecayEntry(FileEntry, PoseEntry):
             shapes=found.shapes if len(signals) > 1 else None,
         )
         seen = Seen(signals, tuple(GIVEN.get(x.kind, ORDERS[self.quantity]) for x in signals))
-        pose = self.at(spec.study)
+        pose = self.at(models.study)
         return MachineModes(self, models.bench, measured, pose, seen, found.diagram)

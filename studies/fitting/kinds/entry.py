@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
 from studies.errors import StudyError, field_error
-from studies.fitting.bench import Bench
 from studies.fitting.bench import Pose as At
-from studies.fitting.kinds.contract import Measurement, Noise
-from studies.fitting.kinds.motions import RECORDED, Motions
-from studies.fitting.kinds.runs import Runs
+from studies.fitting.kinds.contract import DataEntry, Models, Noise
+from studies.fitting.kinds.motions import RECORDED
 from studies.fitting.tables import column, read_columns
 from studies.fitting.uff import Side
 from studies.study.cases import build_structure
 from studies.study.signals import INPUTS, OUTPUTS, Signal, parse_signal
 from studies.study.spec import Pose, Section, Study, described
-
-if TYPE_CHECKING:
-    from studies.fitting.spec import FitSpec
 
 Positive = Annotated[float, Field(ge=1e-30, le=1e12)]
 Percent = Annotated[float, Field(ge=1e-6, le=1000)]
@@ -33,39 +28,8 @@ ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 GIVEN = {"accelerometer": 2, "motor": 0}
 #: Rows of a measurement that a fit takes: a minute or two of work.
 MOST_ROWS = 20_000
-
-
-class Models(NamedTuple):
-    """What measurements are predicted with."""
-
-    bench: Bench
-    runs: Runs
-    motions: Motions
-
-
-class DataEntry(Section):
-    """Fields of every measurement."""
-
-    kind: str = described(..., "-", "kind of measurement")
-    name: str = described("", "-", "in messages and figures; default: its number", max_length=60)
-    check: bool = described(False, "-", "held out: compared, not fitted")
-
-    def measurement(self, spec: FitSpec, models: Models, path: str) -> Measurement:
-        """The measurement with its data.
-
-        Args:
-            spec: of the fit.
-            models: what predicts it.
-            path: where the entry is written, for messages.
-
-        Raises:
-            StudyError: data that cannot be used, or do not fit the machine.
-        """
-        raise NotImplementedError
-
-    def signals(self, study: Study, path: str) -> tuple[Signal, ...]:
-        """Its input, if it has one, and its outputs."""
-        return ()
+#: Points over time or frequency, at least.
+FEWEST = 3
 
 
 class PoseEntry(DataEntry):
@@ -100,10 +64,10 @@ class FileEntry(DataEntry):
         field = next(x for x in names if hasattr(self, x))
         return [("ordinate", f"{path}.{field}", getattr(self, field), unit_of(output, quantity))]
 
-    def reader(self, spec: FitSpec, path: str) -> Callable[..., np.ndarray]:
+    def reader(self, models: Models, path: str) -> Callable[..., np.ndarray]:
         """What reads a column, of real numbers if not said otherwise; all have one length."""
-        sides = self.sides(spec.study, path)
-        columns = read_columns(self.file, spec.folder, f"{path}.file", self.kind, sides)
+        sides = self.sides(models.study, path)
+        columns = read_columns(self.file, models.folder, f"{path}.file", self.kind, sides)
         thin = getattr(self, "thin", 0)
         thinned = {name: x[:: thin or 1] for name, x in columns.items()}
         lengths: dict[str, int] = {}
@@ -224,8 +188,9 @@ def ascending(x: np.ndarray, name: str, path: str) -> None:
     Raises:
         StudyError: with the first row that does not.
     """
-    if len(x) < 3:
-        raise StudyError(f"{path}: column {name!r} has {len(x)} points; allowed: 3 or more")
+    if len(x) < FEWEST:
+        text = f"column {name!r} has {len(x)} points; allowed: {FEWEST} or more"
+        raise StudyError(f"{path}: {text}")
     if not np.all(np.diff(x) > 0):
         row = int(np.argmax(np.diff(x) <= 0)) + 2
         raise StudyError(f"{path}: column {name!r} must ascend; row {row} does not")

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from jaxmodel.metrics import METRICS
 from studies.errors import StudyError, field_error
-from studies.fitting.kinds.contract import Measurement
-from studies.fitting.kinds.entry import DataEntry, Models, NoiseEntry
+from studies.fitting.kinds.contract import DataEntry, Measurement, Models
+from studies.fitting.kinds.entry import NoiseEntry
 from studies.fitting.kinds.runs import Runs, Switch
 from studies.study.entries import Entries, entry_sizes, parse_entries
 from studies.study.links import OneALink
 from studies.study.spec import described
-
-if TYPE_CHECKING:
-    from studies.fitting.spec import FitSpec
 
 
 class FiguresEntry(DataEntry, NoiseEntry):
@@ -39,8 +36,8 @@ class FiguresEntry(DataEntry, NoiseEntry):
         None, "-", "under control; default: those of the study"
     )
 
-    def measurement(self, spec: FitSpec, models: Models, path: str) -> Measurement:
-        control = spec.study.control
+    def measurement(self, models: Models, path: str) -> Measurement:
+        control = models.study.control
         switch = Switch(self.links or control.links, self.modes or control.modes)
         if self.of == "reduction" and (control.feedback == "none" or not any(switch.links)):
             raise StudyError(f"{path}.of = 'reduction': no link is under control in this study")
@@ -49,7 +46,7 @@ class FiguresEntry(DataEntry, NoiseEntry):
             raise field_error(f"{path}.modes", switch.modes, allowed)
         entries, sigma = [], []
         for name, value in self.values.items():
-            entries.append(parse_entries(name, f"{path}.values", entry_sizes(spec.study)))
+            entries.append(parse_entries(name, f"{path}.values", entry_sizes(models.study)))
             if self.amplitude and self.of != "reduction" and value < 0:
                 allowed = "0 or more where amplitude = true"
                 raise field_error(f"{path}.values.{name}", value, allowed)

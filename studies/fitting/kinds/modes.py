@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from abc import abstractmethod
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 import scipy
@@ -17,13 +17,10 @@ from pydantic import Field
 from studies.errors import StudyError, field_error
 from studies.fitting.bench import Bench, Modes, PlantAt, Pose
 from studies.fitting.decays import Diagram
-from studies.fitting.kinds.contract import Measurement, Numbers
-from studies.fitting.kinds.entry import DataEntry, Models, PoseEntry, Positive, each
+from studies.fitting.kinds.contract import DataEntry, Measurement, Models, Numbers
+from studies.fitting.kinds.entry import PoseEntry, Positive, each
 from studies.study.signals import Signal, signal_name
 from studies.study.spec import described
-
-if TYPE_CHECKING:
-    from studies.fitting.spec import FitSpec
 
 #: Modes closer than this share one subspace [1].
 NEAR = 0.03
@@ -57,7 +54,7 @@ class ModesEntry(PoseEntry):
     )
     link: int = described(1, "1", "with ends = 'held'", ge=1, le=3)
 
-    def measurement(self, spec: FitSpec, models: Models, path: str) -> Measurement:
+    def measurement(self, models: Models, path: str) -> Measurement:
         bench, count = models.bench, len(self.frequency_hz)
         for name, ends in (("link", "machine"), ("pose", "held")):
             if name in self.model_fields_set and self.ends == ends:
@@ -83,7 +80,7 @@ class ModesEntry(PoseEntry):
             shapes=self._shapes(bench, path) if self.shapes else None,
         )
         if self.ends == "machine":
-            return MachineModes(self, bench, measured, self.at(spec.study))
+            return MachineModes(self, bench, measured, self.at(models.study))
         if count > bench.structure.n_modes:
             allowed = f"at most link.modes = {bench.structure.n_modes} frequencies"
             raise field_error(f"{path}.frequency_hz", self.frequency_hz, allowed)

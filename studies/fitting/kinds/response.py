@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from studies.errors import StudyError, field_error
 from studies.fitting.bench import Bench, response
 from studies.fitting.kinds import entry as common
-from studies.fitting.kinds.contract import Line, Measurement, Noise, Residual, scaled
+from studies.fitting.kinds.contract import Line, Measurement, Models, Noise, Residual, scaled
 from studies.fitting.kinds.entry import (
-    Models,
     NoiseEntry,
     Percent,
     Positive,
@@ -25,9 +24,6 @@ from studies.fitting.records import RecordSettings, recorded_response
 from studies.fitting.uff import Side
 from studies.study.signals import INPUTS
 from studies.study.spec import Study, described
-
-if TYPE_CHECKING:
-    from studies.fitting.spec import FitSpec
 
 TWO_PI = 2 * np.pi
 #: A measured response this many times the model's at the starting point has another unit [1].
@@ -64,8 +60,8 @@ class ResponseEntry(FrequencyEntry, NoiseEntry):
         unit = INPUTS[self.signals(study, path)[0].kind][1]
         return [*super().sides(study, path), ("orddenom", f"{path}.input", self.input, unit)]
 
-    def measurement(self, spec: FitSpec, models: Models, path: str) -> Measurement:
-        read = self.reader(spec, path)
+    def measurement(self, models: Models, path: str) -> Measurement:
+        read = self.reader(models, path)
         frequency = self.checked(read(self.frequency), path)
         if self.magnitude:
             if self.unknown:
@@ -108,9 +104,9 @@ class RecordEntry(ShakenEntry):
         0.2, "%", "standard deviation over the value, beside what the coherence says"
     )
 
-    def measurement(self, spec: FitSpec, models: Models, path: str) -> Measurement:
+    def measurement(self, models: Models, path: str) -> Measurement:
         names = self.time, self.source, self.value
-        time, source, output = map(self.reader(spec, path), names)
+        time, source, output = map(self.reader(models, path), names)
         settings = RecordSettings(
             segment=self.segment_s,
             has_window=self.window == "hann",

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
 from studies.errors import StudyError, field_error
-from studies.fitting.kinds.contract import Measurement
-from studies.fitting.kinds.entry import Models, OutputEntry, Positive
+from studies.fitting.kinds.contract import Measurement, Models
+from studies.fitting.kinds.entry import OutputEntry, Positive
 from studies.fitting.kinds.motions import Motion, Recording
 from studies.study.links import OneALink
 from studies.study.signals import OUTPUTS, Signal
 from studies.study.spec import described
-
-if TYPE_CHECKING:
-    from studies.fitting.spec import FitSpec
 
 #: A signal that moves less is at rest [its unit].
 STILL = 1e-15
@@ -43,12 +40,12 @@ class SettlingEntry(OutputEntry):
         None, "-", "under control; default: those of the study"
     )
 
-    def measurement(self, spec: FitSpec, models: Models, path: str) -> Measurement:
+    def measurement(self, models: Models, path: str) -> Measurement:
         if (self.band is None) == (self.band_percent is None):
             raise StudyError(
                 f"{path}: give band [unit of the output] or band_percent [%], one of them"
             )
-        (signal,), longest = self.signals(spec.study, path), spec.study.run.duration
+        (signal,), longest = self.signals(models.study, path), models.study.run.duration
         if signal.kind in ("slider", "platform", "motor"):
             forms = ", ".join(OUTPUTS[x][0] for x in ("sensor", "deflection"))
             raise field_error(f"{path}.output", self.output, f"{forms}, which settle about 0")

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy
 
 from studies.errors import StudyError
-from studies.fitting.kinds.contract import Line, Measurement, Noise, Residual
-from studies.fitting.kinds.entry import Models
+from studies.fitting.kinds.contract import Line, Measurement, Models, Noise, Residual
 from studies.fitting.kinds.response import BenchMeasurement, FrequencyEntry
 from studies.study.spec import described
-
-if TYPE_CHECKING:
-    from studies.fitting.spec import FitSpec
 
 
 class SpectrumEntry(FrequencyEntry):
@@ -23,8 +19,8 @@ class SpectrumEntry(FrequencyEntry):
     density: str = described("density", "-", "column, unit^2/Hz in any scale")
     averages: int = described(1, "1", "independent spectra in the mean", ge=1, le=10**6)
 
-    def measurement(self, spec: FitSpec, models: Models, path: str) -> Measurement:
-        frequency, density = map(self.reader(spec, path), (self.frequency, self.density))
+    def measurement(self, models: Models, path: str) -> Measurement:
+        frequency, density = map(self.reader(models, path), (self.frequency, self.density))
         keep = self.checked(frequency, path) > 0  # the mean says nothing about white noise
         if np.any(density[keep] <= 0):
             raise StudyError(

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from studies.errors import StudyError
-from studies.fitting.kinds.contract import Line, Measurement, Noise
-from studies.fitting.kinds.entry import Models, NoiseEntry, ThinnedEntry, ascending
+from studies.fitting.kinds.contract import Line, Measurement, Models, Noise
+from studies.fitting.kinds.entry import NoiseEntry, ThinnedEntry, ascending
 from studies.fitting.kinds.motions import Motion
 from studies.fitting.kinds.unknown import Adjusted, adjusted, noise_error
 from studies.study.signals import OUTPUTS, Signal
 from studies.study.spec import described
-
-if TYPE_CHECKING:
-    from studies.fitting.spec import FitSpec
 
 
 class TraceEntry(ThinnedEntry, NoiseEntry):
@@ -27,16 +24,16 @@ class TraceEntry(ThinnedEntry, NoiseEntry):
         (), "-", "of gain and offset, what nobody knows"
     )
 
-    def measurement(self, spec: FitSpec, models: Models, path: str) -> Measurement:
-        time, value = data = np.stack(list(map(self.reader(spec, path), (self.time, self.value))))
+    def measurement(self, models: Models, path: str) -> Measurement:
+        time, value = data = np.stack(list(map(self.reader(models, path), (self.time, self.value))))
         ascending(time, self.time, path)
-        longest = spec.study.run.duration
+        longest = models.study.run.duration
         if time[0] < 0 or time[-1] > longest:
             raise StudyError(
                 f"{path}: times from {time[0]:g} to {time[-1]:g} s; allowed: within the run, 0 to "
                 f"{longest:g} [s] (run.duration)"
             )
-        (signal,), noise = self.signals(spec.study, path), self.noise(value, path)
+        (signal,), noise = self.signals(models.study, path), self.noise(value, path)
         return Trace(self, models.motions.of(None), signal, data, noise)
 
 

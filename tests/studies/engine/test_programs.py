@@ -17,6 +17,7 @@ from jaxmodel.sampled_loop import closed_loop
 from jaxmodel.simulate import command, simulate
 from studies import config, sources
 from studies.engine import programs
+from studies.engine.function import BlockFunction
 from studies.engine.programs import kept_data, kept_jit
 from studies.kernels import compilation
 from studies.space.free import Placing
@@ -232,3 +233,11 @@ def test_functions_of_the_model_run_as_one_program():
     assert float(jax.grad(lambda x: scaled(("b", 1), x))(1.0)) == 3.0
     for function in (prepare, closed_loop, simulate, command, linearise, find_bases):
         assert function.__wrapped__ and function.__doc__
+
+
+def test_a_block_is_prepared_in_groups_also_with_empty_lists():
+    block = object.__new__(BlockFunction)
+    block.lanes = 16
+    block._prepared = lambda axis, free, own, shared: [jnp.stack([own[0] + shared, own[0]])]
+    (found,) = block.prepare((), [np.arange(16.0), np.zeros((16, 0))], 1.0)
+    np.testing.assert_array_equal(found, [np.arange(16) + 1, np.arange(16)])
