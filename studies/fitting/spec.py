@@ -24,7 +24,7 @@ from studies.fitting.kinds.settling import SettlingEntry
 from studies.fitting.kinds.spectrum import SpectrumEntry
 from studies.fitting.kinds.trace import TraceEntry
 from studies.show.units import headed, readable
-from studies.space.axes import Range
+from studies.space.axes import Finite, Range, WrittenRange, parse_range
 from studies.space.free import (
     FreeNumbers,
     check_twice,
@@ -81,11 +81,18 @@ class Next(Section):
     count: int = described(1, "1", "measurements that are taken at once", ge=1, le=10)
 
 
+class WrittenPrior(WrittenRange):
+    """Bounds of a free number, and what is known of it beforehand."""
+
+    mean: Finite | None = described(None, "", "most likely value, beside sigma")
+    sigma: Finite | None = described(None, "", "its standard deviation")
+
+
 class Fit(Section):
     """What is free, and what was measured."""
 
-    free: dict[str, Any] = described(..., "-", "field = {from, to, scale, mean, sigma}")
-    data: tuple[dict[str, Any], ...] = described(..., "-", "measurements", min_length=1)
+    free: dict[str, object] = described(..., "-", "field = {from, to, scale, mean, sigma}")
+    data: tuple[dict[str, object], ...] = described(..., "-", "measurements", min_length=1)
     loss: Literal["squares", "robust"] = described(
         "squares", "-", "of residuals; robust: outliers pull less"
     )
@@ -216,26 +223,17 @@ def parse_fit(data: dict[str, Any], folder: str | Path = ".") -> FitSpec:
 def _free(fit: Fit, study: Study) -> tuple[FreeNumbers, tuple[Prior, ...]]:
     if not fit.free:
         raise field_error("fit.free", {}, "one free field or more")
-    parts, priors = [], []
+    parts, priors = list[Any](), list[Prior]()
     for name, written in fit.free.items():
         path = f"fit.free.{shown_name(name)}"
-        prior = {}
-        if isinstance(written, dict):
-            known_keys = ("from", "to", "scale", "mean", "sigma")
-            for key in set(written) - set(known_keys):
-                hint = nearest(key, known_keys)
-                raise field_error(f"{path}.{key}", written[key], ", ".join(known_keys), hint=hint)
-            prior = {k: written[k] for k in ("mean", "sigma") if k in written}
-            written = {k: v for k, v in written.items() if k not in prior}
-        parts.append(plain_numbers(name, written, study, path, (DESIGN, MACHINE)))
-        priors += [(prior, path)] * len(parts[-1][0])
+        first, form = sum(len(numbers) for numbers, _ in parts), WrittenPrior
+        roles = DESIGN, MACHINE
+        parts.append(plain_numbers(name, written, study, path, roles, form=form))
+        known = _prior(*parse_range(written, path, form), path)
+        priors += [Prior(first + k, *known) for k in range(len(parts[-1][0])) if known]
     free = join_numbers(parts)
     check_twice(free.numbers, "fit.free")
-    return free, tuple(
-        _prior(prior, k, path, free.numbers[k].span)
-        for k, (prior, path) in enumerate(priors)
-        if prior
-    )
+    return free, tuple(priors)
 
 
 def number_unit(name: str) -> str:
@@ -262,20 +260,21 @@ def shown_value(name: str, value: float, digits: str = ".4g") -> str:
     return f"{factor * value:{digits}} {unit}".rstrip()
 
 
-def _prior(written: dict[str, Any], k: int, path: str, span: Range) -> Prior:
-    for name in ("mean", "sigma"):
-        value = written.get(name)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e150:
-            raise field_error(f"{path}.{name}", value, "a finite number, beside mean or sigma")
-    mean, least = written["mean"], 1e-9 * (span.high - span.low)
-    if not span.low <= mean <= span.high:
-        raise field_error(f"{path}.mean", mean, f"{span.low:g} to {span.high:g}, its bounds")
-    if written["sigma"] < least:
-        raise field_error(f"{path}.sigma", written["sigma"], f"{least:g} or more")
-    return Prior(k, float(written["mean"]), float(written["sigma"]))
+def _prior(span: Range, known: WrittenPrior, path: str) -> tuple[float, float] | None:
+    """Mean and standard deviation of what is known of a number beforehand."""
+    if (known.mean, known.sigma) == (None, None):
+        return None
+    if known.mean is None or known.sigma is None:
+        missing = "mean" if known.mean is None else "sigma"
+        raise StudyError(f"{path}.{missing}: missing; allowed: mean and sigma, or none of them")
+    if not span.low <= known.mean <= span.high:
+        raise field_error(f"{path}.mean", known.mean, f"{span.low:g} to {span.high:g}, its bounds")
+    if known.sigma < (least := 1e-9 * (span.high - span.low)):
+        raise field_error(f"{path}.sigma", known.sigma, f"{least:g} or more")
+    return known.mean, known.sigma
 
 
-def _entry(written: dict[str, Any], k: int, study: Study) -> DataEntry:
+def _entry(written: dict[str, object], k: int, study: Study) -> DataEntry:
     path = f"fit.data[{k}]"
     kind = written.get("kind")
     if not isinstance(kind, str) or kind not in ENTRIES:

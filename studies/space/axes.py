@@ -9,15 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import combinations, product
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
+from pydantic import Field, ValidationError
 
 from jaxmodel.laws.state_space import STATE_SPACE
 from studies.errors import field_error, nearest, shown_name
 from studies.study.consistency import patch_centers, patch_pitch
+from studies.study.explain import explain
 from studies.study.fields import Columns, column_of
-from studies.study.paths import checked_value, field_choices, known_field
+from studies.study.paths import as_tuples, checked_value, field_choices, known_field
+from studies.study.section import Section, described
 from studies.study.spec import Study
 
 #: Axes with their own names: what each varies, and how it is written.
@@ -55,9 +58,9 @@ SHOWN_AS = ALIASES | {
     "placement": "patches.centers",
     "shaper_frequency": "shaper.frequencies_hz",
 }
-PLACEMENTS = ("same", "mirrored", "per_link")
 #: Numbers beyond this are refused.
 LARGEST = 1e150
+Finite = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 #: Most modes of all links of which every subset becomes a case.
 MOST_MASKED = 15
 #: More values than this from one axis or block are refused.
@@ -125,8 +128,8 @@ def _field_axis(name: str, written: Any, study: Study, path: str) -> Axis:
     if written == "all":
         written = _every_choice(name, base, path, study)
     if isinstance(written, dict):
-        return _range_axis(name, base, parse_range(written, path), study, path)
-    if not isinstance(written, list) or not written:
+        return _range_axis(name, base, parse_range(written, path, WrittenGrid)[0], study, path)
+    if not isinstance(written, list | tuple) or not written:
         raise field_error(path, written, _WRITTEN)
     values = column_of([checked_value(study, name, value, path) for value in written])
     if isinstance(base, tuple) and "[" in name and values.shape[1:] != np.shape(base):
@@ -166,27 +169,51 @@ def _is_number(value: Any) -> bool:
     return is_numeric and abs(value) <= LARGEST
 
 
-def parse_range(written: dict[str, Any], path: str) -> Range:
-    allowed = ("from", "to", "count", "scale")
-    for key in written:
-        if key not in allowed:
-            hint = nearest(key, allowed)
-            raise field_error(f"{path}.{key}", written[key], ", ".join(allowed), hint=hint)
-    for key in ("from", "to"):
-        value = written.get(key)
-        if not _is_number(value):
-            raise field_error(f"{path}.{key}", value, "a finite number up to 1e150 in size")
-    count, scale = written.get("count", 0), written.get("scale", "linear")
-    if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count <= LIMIT:
-        raise field_error(f"{path}.count", count, f"a whole number from 1 to {LIMIT}")
-    if scale not in ("linear", "log"):
-        raise field_error(f"{path}.scale", scale, "'linear' or 'log'")
-    low, high = float(written["from"]), float(written["to"])
+class WrittenRange(Section):
+    """Numbers from low to high, as files write them."""
+
+    low: Finite = described(..., "", "lowest", alias="from")
+    high: Finite = described(..., "", "highest", alias="to")
+    scale: Literal["linear", "log"] = described("linear", "-", "of the numbers between")
+
+
+class WrittenGrid(WrittenRange):
+    """The same with points on a grid."""
+
+    count: int = described(0, "1", "of points for grid and zip; 0: none", ge=0, le=LIMIT)
+
+
+T = TypeVar("T", bound=Section)
+
+
+def parse_section(model: type[T], written: object, path: str) -> T:
+    """A section that is written at a place.
+
+    Raises:
+        StudyError: a field that it has not, or a value that is not allowed.
+    """
+    try:
+        return model.model_validate(as_tuples(written))
+    except ValidationError as error:
+        raise explain(error, model, written, path) from None
+
+
+R = TypeVar("R", bound=WrittenRange)
+
+
+def parse_range(written: object, path: str, model: type[R]) -> tuple[Range, R]:
+    """A range, and all that is written there.
+
+    Raises:
+        StudyError: no range, or one without numbers between its ends.
+    """
+    found = parse_section(model, written, path)
+    low, high = found.low, found.high
     if not low < high:
         raise field_error(f"{path}.to", high, f"more than {path}.from = {low:g}")
-    if scale == "log" and low <= 0:
+    if found.scale == "log" and low <= 0:
         raise field_error(f"{path}.from", low, "more than 0 on a log scale")
-    return Range(low, high, count, scale == "log")
+    return Range(low, high, getattr(found, "count", 0), found.scale == "log"), found
 
 
 def _range_axis(name: str, base: Any, span: Range, study: Study, path: str) -> Axis:
@@ -230,9 +257,9 @@ def _map_axis(axis: Axis, convert: Callable[[np.ndarray], Columns], name: str) -
 def _numbers_axis(written: Any, path: str) -> Axis:
     """Free numbers, named "value"."""
     if isinstance(written, dict):
-        span = parse_range(written, path)
+        span, _ = parse_range(written, path, WrittenGrid)
         return _numeric_axis("value", span, span.at)
-    is_list = isinstance(written, list) and len(written) > 0
+    is_list = isinstance(written, list | tuple) and len(written) > 0
     if not is_list or not all(map(_is_number, written)):
         raise field_error(path, written, "a list of finite numbers, or a range {from, to, ...}")
     return choice_axis({"value": np.array(written, float)})
@@ -269,7 +296,7 @@ def _link_subsets(written: Any, study: Study, path: str) -> Axis:
     subsets = (combinations(numbers, size) for size in range(study.n_links + 1))
     names = ["+".join(subset) or "none" for some in subsets for subset in some]
     chosen = names if written == "all" else written
-    if not isinstance(chosen, list) or not chosen:
+    if not isinstance(chosen, list | tuple) or not chosen:
         raise field_error(path, written, "'all', or a list of " + ", ".join(names))
     for value in chosen:
         if value not in names:
@@ -291,18 +318,15 @@ def _link_mode_masks(written: Any, study: Study, path: str) -> Axis:
     return choice_axis({"control.mode_mask": bits, "link_mode_masks": np.array(text)})
 
 
+class WrittenPlacement(Section):
+    """Patches in order and without overlap."""
+
+    kind: Literal["same", "mirrored", "per_link"] = described("same", "-", "on all links")
+    candidates: int = described(0, "1", "places for grid and zip; 0: none", ge=0, le=60)
+
+
 def _placement(written: Any, study: Study, path: str) -> Axis:
-    if not isinstance(written, dict):
-        raise field_error(path, written, "a table {kind = ..., candidates = ...}")
-    for key in written:
-        if key not in ("kind", "candidates"):
-            raise field_error(f"{path}.{key}", written[key], "kind, candidates")
-    kind, candidates = written.get("kind", "same"), written.get("candidates", 0)
-    if kind not in PLACEMENTS:
-        hint = nearest(str(kind), PLACEMENTS)
-        raise field_error(f"{path}.kind", kind, ", ".join(map(repr, PLACEMENTS)), hint=hint)
-    if isinstance(candidates, bool) or not isinstance(candidates, int) or not 0 <= candidates <= 60:
-        raise field_error(f"{path}.candidates", candidates, "a whole number from 1 to 60", "1")
+    kind, candidates = dict(parse_section(WrittenPlacement, written, path)).values()
     count = patch_centers(study).shape[1]
     lengths, pitches = study.each_link(study.link.length), patch_pitch(study)
     if kind == "per_link":

@@ -16,7 +16,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.numbers import Numbers, case_of
 from jaxmodel.parameters import Array
 from studies.errors import StudyError, field_error, nearest, nearest_field
-from studies.space.axes import ALIASES, READY_MADE, Range, parse_range
+from studies.space.axes import ALIASES, READY_MADE, Range, WrittenRange, parse_range
 from studies.study.numbers import position, put
 from studies.study.paths import (
     Parts,
@@ -140,23 +140,25 @@ def _part(place: Place, first: int, after: int, numbers: Numbers, values: Array)
 
 def plain_numbers(
     name: str,
-    bounds: Any,
+    written: object,
     study: Study,
     path: str,
     roles: Sequence[str],
     others: Sequence[str] = (),
     parts: Sequence[Parts] = (),
+    form: type[WrittenRange] = WrittenRange,
 ) -> tuple[list[Free], Place]:
     """The numbers of one free field, and what puts their values among those of a study.
 
     Args:
         name: field, entry of a list, or list.
-        bounds: its range as the file writes it.
+        written: its range as the file has it.
         study: where it starts from.
         path: where it is written, for messages.
         roles: of the fields that can be free, besides the parts' own.
         others: further names that can be, for messages.
         parts: laws and drives whose parameters can be free; (): those of the study.
+        form: of the range.
 
     Raises:
         StudyError: unknown name, bad bounds, a start outside them.
@@ -177,7 +179,7 @@ def plain_numbers(
             + (f"; did you mean {hint!r}?" if hint else "")
         )
     _check_field(entry.field, study, path)
-    span = parse_bounds(bounds, path)
+    span, _ = parse_range(written, path, form)
     numbers, positions = [], []
     for indices, start in numbers_in(value):
         whole = (*entry.indices, *indices)
@@ -204,18 +206,6 @@ def _check_field(field: str, study: Study, path: str) -> None:
         raise field_error(
             "control.ratio_source", study.control.ratio_source, f"'given' where {path} is free"
         )
-
-
-def parse_bounds(bounds: Any, path: str) -> Range:
-    """Bounds of a free parameter.
-
-    Raises:
-        StudyError: not a range, or one with points.
-    """
-    allowed = "a range {from = ..., to = ..., scale = 'linear' or 'log'}"
-    if not isinstance(bounds, dict) or "count" in bounds:
-        raise field_error(path, bounds, allowed)
-    return parse_range(bounds, path)
 
 
 def numbers_in(value: Any, indices: tuple[int, ...] = ()) -> list[tuple[tuple[int, ...], float]]:

@@ -14,15 +14,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from jaxmodel.loop_figures import HIGHEST, MARGINS, PEAKS
 from studies.errors import StudyError, field_error, nearest
 from studies.reading import check_depth
+from studies.space.axes import parse_section
 from studies.space.methods import METHODS
 from studies.study.choices import OWN, OneOf
 from studies.study.entries import entry_sizes, parse_entries
-from studies.study.explain import explain
 from studies.study.files import read_toml
 from studies.study.margin import ENOUGH
 from studies.study.spec import Section, Study, described, parse_study
@@ -35,9 +35,9 @@ class Block(Section):
     method: Annotated[str, OneOf(lambda: METHODS, OWN)] = described(
         "grid", "-", "how axes and blocks combine"
     )
-    axes: dict[str, Any] = described({}, "-", "field or ready-made axis = values")
-    blocks: tuple[dict[str, Any], ...] = described((), "-", "further blocks")
-    cases: tuple[dict[str, Any], ...] = described(
+    axes: dict[str, object] = described({}, "-", "field or ready-made axis = values")
+    blocks: tuple[Block, ...] = described((), "-", "further blocks")
+    cases: tuple[dict[str, object], ...] = described(
         (), "-", "for method list: field = value, per case"
     )
     count: int = described(0, "1", "points of a sampling method", ge=0, le=10**12)
@@ -142,8 +142,7 @@ def parse_sweep(data: dict[str, Any]) -> SweepSpec:
     study = with_window(
         parse_study({name: value for name, value in data.items() if name != "sweep"})
     )
-    sweep = _parse_block(Sweep, data["sweep"], "sweep")
-    assert isinstance(sweep, Sweep)
+    sweep = parse_section(Sweep, data["sweep"], "sweep")
     entry = sweep.by.removeprefix("-") if sweep.keep else sweep.by  # - for the largest first
     ranking = parse_entries(entry, "sweep.by", _known_sizes(study)).metric
     is_ranked = sweep.keep or "by" in data["sweep"]
@@ -186,35 +185,16 @@ def _check_kept(sweep: Sweep, written: dict[str, Any]) -> None:
             raise field_error(f"sweep.{name}", value, f"{default!r} with sweep.keep")
 
 
-def _parse_block(model: type[Block], data: Any, path: str) -> Block:
-    try:
-        block = model.model_validate(_tuples(data))
-    except ValidationError as error:
-        raise explain(error, model, data, inside=path) from None
-    _check_block(block, path)
-    return block
-
-
-def _tuples(data: Any) -> Any:
-    """Lists of blocks and cases as tuples; their contents are checked where they are used."""
-    if not isinstance(data, dict):
-        return data
-    listed = ("blocks", "cases", "environments", "links", "metrics", "robustness")
-    return {k: tuple(v) if k in listed and isinstance(v, list) else v for k, v in data.items()}
-
-
 #: Blocks can be nested this deep.
 DEEPEST = 20
 
 
 def _node(block: Block, path: str, depth: int = 0) -> BlockNode:
-    children = []
     if depth > DEEPEST:
         raise StudyError(f"sweep.blocks: nested {depth} deep; allowed: up to {DEEPEST}")
-    for k, data in enumerate(block.blocks):
-        inner = f"{path}.blocks.{k}"
-        children.append(_node(_parse_block(Block, data, inner), inner, depth + 1))
-    return BlockNode(block, tuple(children), path)
+    _check_block(block, path)
+    inner = (_node(x, f"{path}.blocks.{k}", depth + 1) for k, x in enumerate(block.blocks))
+    return BlockNode(block, tuple(inner), path)
 
 
 def _check_block(block: Block, path: str) -> None:

@@ -21,6 +21,7 @@ _PLURALS = {
     float: "finite numbers",
     str: "texts",
     dict: "tables",
+    object: "values",
 }
 
 #: Sections beyond those of a study; commands of the same name read them.
@@ -80,7 +81,7 @@ def allowed_values(
     if origin is tuple:
         return _entries(arguments, metadata, sizes)
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return f"a section with fields {', '.join(annotation.model_fields)}"
+        return f"a section with fields {', '.join(written_fields(annotation))}"
     return " ".join(filter(None, (_WORDS[annotation], _range(metadata))))
 
 
@@ -101,7 +102,8 @@ def _entries(
         return "an empty list"
     entry = arguments[0]
     inner = get_args(entry)[0] if hasattr(entry, "__metadata__") else entry
-    inner = dict if get_origin(inner) is dict else inner
+    is_section = isinstance(inner, type) and issubclass(inner, BaseModel)
+    inner = dict if is_section or get_origin(inner) is dict else inner
     least, most = _bound(metadata, "min_length"), _bound(metadata, "max_length")
     mark = _mark(metadata)
     if mark:
@@ -150,48 +152,95 @@ def _range(metadata: Iterable[Any]) -> str:
 
 def explain(
     error: ValidationError,
-    study: type[BaseModel],
-    data: dict[str, Any],
+    model: type[BaseModel],
+    data: Any,
     inside: str = "",
     sizes: Mapping[str, int] | None = None,
 ) -> StudyError:
     """The first fault that pydantic found, in the words of the study file.
 
-    error: what validation raised. study: the outermost model. data: what was validated.
+    error: what validation raised. model: the outermost one. data: what was validated.
     inside: name of the section that the model describes, "" for a whole study.
     sizes: see `allowed_values`.
     """
-    fault = error.errors(include_url=False)[0]
-    location = list(fault["loc"])
-    model, used, info = study, 0, None
-    for used, part in enumerate(location, 1):
-        info = model.model_fields.get(str(part))
-        if info is None:
-            return _unknown(study, model, location[:used], fault["input"], inside)
-        inner = info.annotation
-        if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
-            break
-        model = inner
-    if info is None:
-        return field_error(inside or "study", fault["input"], allowed_values(study, (), sizes))
+    faults = error.errors(include_url=False)
+    # what a field is missing for is a misspelt one
+    fault = next((x for x in faults if x["type"] == "extra_forbidden"), faults[0])
+    fault = fault if faults[0]["type"] == "missing" else faults[0]
+    annotation: Any = model
+    metadata, unit, value = list[Any](), "", data
+    name: list[Any] = [inside] if inside else []
     is_missing = fault["type"] == "missing"
-    return _bad_value(info, location[:used], location[used:], is_missing, data, inside, sizes)
+    # an entry of a list is named by its index if its type is clear
+    for part in fault["loc"]:
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            info = written_fields(annotation).get(str(part))
+            if info is None:
+                return _unknown(model, annotation, name, str(part), fault["input"], inside)
+            annotation, metadata, unit = info.annotation, list(info.metadata), unit_of(info)
+        elif get_origin(annotation) is dict and isinstance(part, str):
+            annotation, metadata = get_args(annotation)[1], []
+        elif get_origin(annotation) is tuple and isinstance(part, int) and not is_missing:
+            arguments = get_args(annotation)
+            annotation = arguments[0] if arguments[-1] is Ellipsis else arguments[part]
+            metadata = []
+        else:
+            break
+        annotation, metadata = _plain(annotation, metadata)
+        name = [*name, shown_name(str(part)) if isinstance(part, str) else part]
+        if not (is_missing and name and isinstance(value, dict) and part not in value):
+            value = value[part]
+        else:
+            allowed = allowed_values(annotation, metadata, sizes)
+            text = f"{_dotted(name)}: missing; allowed: {allowed}"
+            return StudyError(f"{text} [{unit}]" if unit else text)
+    hint = nearest(value, _choices_within(annotation, metadata)) if isinstance(value, str) else ""
+    allowed = allowed_values(annotation, metadata, sizes)
+    return field_error(_dotted(name) or "study", value, allowed, unit, hint)
+
+
+def written_fields(model: type[BaseModel]) -> dict[str, FieldInfo]:
+    """Fields of a section by their names in files."""
+    return {info.alias or name: info for name, info in model.model_fields.items()}
+
+
+def _plain(annotation: Any, metadata: list[Any]) -> tuple[Any, list[Any]]:
+    """A type without its limits and without None, and the limits."""
+    if hasattr(annotation, "__metadata__"):
+        return get_args(annotation)[0], _limits(annotation)
+    others = [x for x in get_args(annotation) if x is not type(None)]
+    if get_origin(annotation) in (Union, UnionType) and len(others) == 1:
+        return _plain(others[0], metadata)
+    return annotation, metadata
+
+
+def _choices_within(annotation: Any, metadata: list[Any]) -> list[str]:
+    """Texts that a type allows, also as one of several."""
+    branches = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else ()
+    own = [x for x in choices_of(annotation, metadata) if isinstance(x, str)]
+    return own + [name for x in branches for name in _choices_within(x, [])]
 
 
 def _unknown(
-    study: type[BaseModel], model: type[BaseModel], location: list[Any], value: Any, inside: str
+    outermost: type[BaseModel],
+    model: type[BaseModel],
+    name: list[Any],
+    leaf: str,
+    value: Any,
+    inside: str,
 ) -> StudyError:
-    name = str(location[-1])
-    prefix = "".join(f"{part}." for part in [inside, *location[:-1]] if part != "")
-    field = prefix + name
-    own = nearest(name, model.model_fields)
-    close = prefix + own if own else nearest_field(field, _fields(study, inside))
+    section = _dotted(name)
+    field = f"{section}.{leaf}".lstrip(".")
+    own = nearest(leaf, written_fields(model))
+    close = (
+        f"{section}.{own}".lstrip(".") if own else nearest_field(field, _fields(outermost, inside))
+    )
     close = SUCCESSORS.get(field, close)
     hint = f"did you mean {close!r}?" if close else ""
-    where = f"in [{prefix.rstrip('.')}]" if prefix else "at the top"
-    if not prefix and name in COMMANDS:
-        hint = f"`studies {name}` reads that; a study alone has none"
-    hint = hint or f"allowed: {where}: {', '.join(model.model_fields)}"
+    where = f"in [{section}]" if section else "at the top"
+    if not section and leaf in COMMANDS:
+        hint = f"`studies {leaf}` reads that; a study alone has none"
+    hint = hint or f"allowed: {where}: {', '.join(written_fields(model))}"
     return StudyError(f"{shown_name(field)} = {shown(value)}: unknown field; {hint}")
 
 
@@ -204,43 +253,5 @@ def _fields(study: type[BaseModel], inside: str) -> list[str]:
     ]
 
 
-def _bad_value(
-    info: FieldInfo,
-    name: list[Any],
-    entries: list[Any],
-    is_missing: bool,
-    data: dict[str, Any],
-    inside: str,
-    sizes: Mapping[str, int] | None,
-) -> StudyError:
-    annotation, metadata = info.annotation, list(info.metadata)
-    if is_missing and not entries:
-        unit = unit_of(info)
-        allowed = allowed_values(annotation, metadata, sizes)
-        text = f"{_dotted(inside, name)}: missing; allowed: {allowed}"
-        return StudyError(f"{text} [{unit}]" if unit else text)
-    value: Any = data
-    for part in name:
-        value = value[part]
-    # an entry of a list is named by its index if its type is clear
-    for part in entries[:-1] if is_missing else entries:
-        if get_origin(annotation) is dict and isinstance(part, str):
-            annotation, metadata, value = get_args(annotation)[1], [], value[part]
-            name = [*name, part]
-            continue
-        if get_origin(annotation) is not tuple or not isinstance(part, int):
-            break
-        arguments = get_args(annotation)
-        annotation = arguments[0] if arguments[-1] is Ellipsis else arguments[part]
-        metadata, value = [], value[part]
-        if hasattr(annotation, "__metadata__"):
-            annotation, metadata = get_args(annotation)[0], _limits(annotation)
-        name = [*name, part]
-    choices = choices_of(annotation, metadata)
-    hint = nearest(value, choices) if isinstance(value, str) else ""
-    allowed = allowed_values(annotation, metadata, sizes)
-    return field_error(_dotted(inside, name), value, allowed, unit_of(info), hint)
-
-
-def _dotted(inside: str, name: list[Any]) -> str:
-    return ".".join(str(part) for part in [inside, *name] if part != "")
+def _dotted(name: list[Any]) -> str:
+    return ".".join(map(str, name))

@@ -7,8 +7,8 @@ overlap, for any numbers in [0, 1].
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from jaxmodel.numbers import Numbers
 from jaxmodel.parameters import Array
 from studies.errors import StudyError, field_error, shown_name
-from studies.space.axes import Range
+from studies.space.axes import Range, parse_section
 from studies.space.free import (
     Free,
     FreeNumbers,
@@ -28,11 +28,11 @@ from studies.space.free import (
 )
 from studies.study.consistency import patch_centers, patch_pitch
 from studies.study.paths import Parts
-from studies.study.spec import DESIGN, Study
+from studies.study.section import DESIGN, Section, described
+from studies.study.spec import Study
 
 #: Free name that stands for several numbers.
 PLACEMENT = "placement"
-PLACEMENTS = ("same", "per_link")
 #: Fields that it sets or relies on.
 DECIDED = ("patches.", "link.length")
 
@@ -42,7 +42,9 @@ def writes(number: Free) -> tuple[str, ...]:
     return ("patches.centers",) if number.key == PLACEMENT else (number.name,)
 
 
-def free_numbers(written: dict[str, Any], study: Study, parts: Sequence[Parts] = ()) -> FreeNumbers:
+def free_numbers(
+    written: Mapping[str, object], study: Study, parts: Sequence[Parts] = ()
+) -> FreeNumbers:
     """Free parameters from what the file says.
 
     Args:
@@ -84,15 +86,20 @@ def _check_decided(numbers: Sequence[Free]) -> None:
             raise StudyError(f"tune.free.{number.key}: {PLACEMENT} is free too and decides it")
 
 
-def _placement(bounds: Any, study: Study, path: str) -> tuple[list[Free], Place]:
-    if not isinstance(bounds, dict) or set(bounds) != {"kind"} or bounds["kind"] not in PLACEMENTS:
-        raise field_error(path, bounds, "{kind = 'same'} or {kind = 'per_link'}")
+class FreePlacement(Section):
+    """Patches whose places are free, in order and without overlap."""
+
+    kind: Literal["same", "per_link"] = described(..., "-", "on all links, or on each")
+
+
+def _placement(bounds: object, study: Study, path: str) -> tuple[list[Free], Place]:
+    kind = parse_section(FreePlacement, bounds, path).kind
     centers, pitch, length = (
         patch_centers(study),
         patch_pitch(study),
         study.each_link(study.link.length),
     )
-    links, count = (1 if bounds["kind"] == "same" else study.n_links), centers.shape[1]
+    links, count = (1 if kind == "same" else study.n_links), centers.shape[1]
     if links == 1:  # room on all links
         pitch, length = pitch.max(keepdims=True), length.min(keepdims=True)
     free = length - count * pitch

@@ -306,15 +306,14 @@ def _can_take(spec: TuneSpec, family: Family, other: Family) -> bool:
     is_same_study = repr(family.columns) == repr(other.columns)
     differing = {name for name, x in family.limits.items() if other.limits[name] != x}
     is_known = all(
-        name == spec.tune.pareto.get("limit") and family.limits[name] != BASELINE
-        for name in differing
+        name == spec.front_limit and family.limits[name] != BASELINE for name in differing
     )
     return other is not family and is_same_study and is_part and is_known
 
 
 def _limits_in(spec: TuneSpec, at: Progress, start: int, family: Family) -> np.ndarray:
     """Violation of another family's limits by a start's best design, (m,)."""
-    limits, along = at.best_limits[start].copy(), spec.tune.pareto.get("limit")
+    limits, along = at.best_limits[start].copy(), spec.front_limit
     if along in spec.limit_names and family.limits[along] != BASELINE:
         k = spec.limit_names.index(along)
         limits[k] = at.best_peaks[start, k] / float(family.limits[along]) - 1

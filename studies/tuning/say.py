@@ -333,7 +333,7 @@ def _limits(findings: TuneFindings) -> Chapter | None:
         where = f"the worst of {machines.count} machines, the nominal one among them"
     front = None
     if spec.metric_limits:
-        along = spec.tune.pareto.get("limit", spec.metric_limits[0])
+        along = spec.front_limit or spec.metric_limits[0]
         front = drawing(plots.front, spec, findings, along)
     return chapter(
         "Limits on the scenarios of the tuning",

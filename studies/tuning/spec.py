@@ -16,12 +16,13 @@ Everything is measured against the baseline, machine by machine and move by move
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 from itertools import combinations, product
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import Field
 
 from jaxmodel.drives import DRIVES
 from jaxmodel.laws import LAWS
@@ -30,10 +31,10 @@ from jaxmodel.metrics import METRICS
 from jaxmodel.numbers import SWITCHES
 from studies.engine.preflight import check_run
 from studies.errors import StudyError, field_error, nearest, shown, shown_name
+from studies.space.axes import parse_section
 from studies.space.free import FreeNumbers
 from studies.study.cases import build_structure
 from studies.study.entries import controlled_links, entry_sizes, parse_entries
-from studies.study.explain import explain
 from studies.study.files import read_toml
 from studies.study.paths import (
     Parts,
@@ -63,6 +64,7 @@ MOST = {"disk_margin": 2.0, "phase_margin": MOST_PHASE, "delay_margin": MOST_DEL
 MOST_RUNS = 50_000
 #: Limit that stands for the baseline's value.
 BASELINE = "baseline"
+Positive = Annotated[float, Field(gt=0, le=1e30)]
 
 
 class Scenarios(Section):
@@ -71,11 +73,15 @@ class Scenarios(Section):
     count: int = described(1, "1", "machines; the first is the nominal one", ge=1, le=1000)
     check: int = described(16, "1", "fresh machines, to judge the result", ge=1, le=10_000)
     seed: int = described(0, "1", "of the machines", ge=0, le=10**9)
-    spread: dict[str, Any] = described({}, "-", "field = +-percent of its value")
-    machines: dict[str, Any] = described(
+    spread: dict[str, Annotated[float, Field(gt=0, le=99)]] = described(
+        {}, "%", "field = +-percent of its value"
+    )
+    machines: dict[str, tuple[object, ...]] = described(
         {}, "-", "field = its value on each other machine; first those to tune, last those to check"
     )
-    each: dict[str, Any] = described({}, "-", "field = values; all machines run with each")
+    each: dict[str, Annotated[tuple[object, ...], Field(min_length=1)]] = described(
+        {}, "-", "field = values; all machines run with each"
+    )
     tail: float = described(1.0, "1", "share of worst scenarios that count", ge=0, le=1)
 
     @property
@@ -84,22 +90,39 @@ class Scenarios(Section):
         return bool(self.spread or self.machines)
 
 
+class FamilySection(Section):
+    """What moves in a family of designs, and what is set."""
+
+    free: tuple[str, ...] | None = described(None, "-", "names of tune.free; default: all")
+    set: dict[str, object] = described({}, "-", "field = value")
+
+
+class Pareto(Section):
+    """A front: the tuning again and again with another limit."""
+
+    limit: str = described(..., "-", "a metric in tune.limits")
+    values: tuple[Positive, ...] = described(..., "-", "its limits", min_length=2)
+    family: str | None = described(None, "-", "that moves along it; default: the first")
+
+
 class Tune(Section):
     """Free parameters and objective."""
 
-    free: dict[str, Any] = described({}, "-", "field = {from, to, scale}")
-    objective: dict[str, Any] = described(
+    free: dict[str, object] = described({}, "-", "field = {from, to, scale}")
+    objective: dict[str, Positive] = described(
         {"residual_rms": 1.0},
         "-",
         "metric or figure of the loop = weight, relative to the baseline",
         min_length=1,
     )
-    limits: dict[str, Any] = described(
+    limits: dict[str, Positive | Literal["baseline"]] = described(
         {}, "-", "metric or figure of the loop = limit or 'baseline', on every machine"
     )
     scenarios: Scenarios = Scenarios()
-    families: dict[str, Any] = described({}, "-", "name = {free, set}: what moves, what is set")
-    pareto: dict[str, Any] = described({}, "-", "{limit, values, family}: a Pareto front")
+    families: dict[str, FamilySection] = described(
+        {}, "-", "name = {free, set}: what moves, what is set"
+    )
+    pareto: Pareto | None = described(None, "-", "{limit, values, family}: a Pareto front")
     method: Literal["lbfgs", "adam"] = described("lbfgs", "-", "descent method")
     starts: int = described(8, "1", "starting points of each family", ge=1, le=1024)
     iterations: int = described(60, "1", "evaluations from each starting point", ge=1, le=10_000)
@@ -195,6 +218,11 @@ class TuneSpec(NamedTuple):
         return tuple(name for name in self.tune.limits if name in LOOP_LIMITS)
 
     @property
+    def front_limit(self) -> str:
+        """The metric whose limits span the Pareto front, "" if there is none."""
+        return self.tune.pareto.limit if self.tune.pareto else ""
+
+    @property
     def limit_names(self) -> tuple[str, ...]:
         """All limits, in the order used by evaluations."""
         return (*self.metric_limits, *self.loop_limits)
@@ -220,10 +248,7 @@ def parse_tuning(data: dict[str, Any]) -> TuneSpec:
     study = with_window(
         parse_study({name: value for name, value in data.items() if name != "tune"})
     )
-    try:
-        tune = Tune.model_validate(data["tune"])
-    except ValidationError as error:
-        raise explain(error, Tune, data["tune"], inside="tune") from None
+    tune = parse_section(Tune, data["tune"], "tune")
     _check_figures(tune, study)
     _check_spread(tune, study)
     _check_machines(tune.scenarios, study)
@@ -245,19 +270,20 @@ def parse_tuning(data: dict[str, Any]) -> TuneSpec:
 
 
 def _check_figures(tune: Tune, study: Study) -> None:
-    for name, weight in tune.objective.items():
+    for name in tune.objective:
         _check_metric(name, "tune.objective", LOOP_TERMS, study)
-        _check_positive(weight, 1e30, f"tune.objective.{shown_name(name)}")
     for name, limit in tune.limits.items():
         _check_metric(name, "tune.limits", LOOP_LIMITS, study)
-        if limit != BASELINE:
-            path, hint = f"tune.limits.{shown_name(name)}", BASELINE * isinstance(limit, str)
-            most = MOST.get(name, 1e30)
-            _check_positive(limit, most, path, more=f" or {BASELINE!r}", hint=hint)
+        most = MOST.get(name, np.inf)
+        if not isinstance(limit, str) and limit > most:
+            allowed = f"a number > 0 and <= {most:g} or {BASELINE!r}"
+            raise field_error(f"tune.limits.{shown_name(name)}", limit, allowed)
     for name, part in tune.limits.items():
         metric = _field(name)
         whole = tune.limits.get(metric, BASELINE)
-        if name != metric and BASELINE not in (whole, part) and part > whole:
+        if isinstance(whole, str) or isinstance(part, str) or name == metric:
+            continue
+        if part > whole:
             raise StudyError(
                 f"tune.limits: {name} = {part:g} allows more than {metric} = {whole:g}, "
                 "which holds for all its entries; leave one out"
@@ -271,7 +297,6 @@ def _check_spread(tune: Tune, study: Study) -> None:
         numbers = value if is_each_link(name) and isinstance(value, tuple) else (value,)
         if not all(isinstance(number, float) for number in numbers):
             raise field_error(path, percent, f"for a number; {name} is {shown(value)}")
-        _check_positive(percent, 99.0, path, "%")
         if not any(numbers):
             raise field_error(name, value, f"not 0 where {path} is a share of it")
         if name.partition(".")[0] in ("run", "metrics", "motion"):
@@ -288,8 +313,6 @@ def _check_machines(scenarios: Scenarios, study: Study) -> None:
         _check_program(name, path)
         if name.partition(".")[0] in ("run", "metrics", "motion"):
             raise StudyError(f"{path}: allowed: the machine and its control; each takes others")
-        if not isinstance(values, list):
-            raise field_error(path, values, "a list with a value for each machine")
         if len(values) < needed:
             raise StudyError(
                 f"{path}: {len(values)} values; allowed: {needed} or more, for "
@@ -326,7 +349,7 @@ def _each_machine(scenarios: Scenarios) -> list[dict[str, Any]]:
     return others(whole, scenarios.count, False) + others(whole, scenarios.check, True)
 
 
-def others(values: list[Any], count: int, is_fresh: bool) -> list[Any]:
+def others(values: Sequence[Any], count: int, is_fresh: bool) -> list[Any]:
     """Of what is given for each other machine, what `count` machines take.
 
     Args:
@@ -334,7 +357,7 @@ def others(values: list[Any], count: int, is_fresh: bool) -> list[Any]:
         count: machines that run, the study's own among them unless they are fresh.
         is_fresh: machines to check the result, not to tune.
     """
-    return values[-count:] if is_fresh else values[: count - 1]
+    return list(values[-count:] if is_fresh else values[: count - 1])
 
 
 def _check_feedback(tune: Tune, study: Study) -> None:
@@ -360,14 +383,6 @@ def _check_switching(tune: Tune, study: Study, families: tuple[Family, ...]) -> 
                 f"tune.objective.{terms[0]}: control.law {law!r} switches between loops; allowed: "
                 "laws with one linear loop, or a limit instead"
             )
-
-
-def _check_positive(
-    number: Any, most: float, path: str, unit: str = "", more: str = "", hint: str = ""
-) -> None:
-    is_number = isinstance(number, (int, float)) and not isinstance(number, bool)
-    if not is_number or not 0 < number <= most:
-        raise field_error(path, number, f"a number > 0 and <= {most:g}{more}", unit, hint)
 
 
 def _check_metric(name: str, path: str, of_loop: tuple[str, ...], study: Study) -> None:
@@ -404,8 +419,6 @@ def _moves(tune: Tune, study: Study) -> tuple[dict[str, Any], ...]:
         path = f"tune.scenarios.each.{shown_name(name)}"
         known_field(name, study, "tune.scenarios.each")
         _check_program(name, path)
-        if not isinstance(values, list) or not values:
-            raise field_error(path, values, "a list of values")
         columns[name] = [checked_value(study, name, value, path) for value in values]
     return tuple(
         dict(zip(columns, combination, strict=True)) for combination in product(*columns.values())
@@ -415,7 +428,11 @@ def _moves(tune: Tune, study: Study) -> tuple[dict[str, Any], ...]:
 def _check_clashes(tune: Tune, free: FreeNumbers, families: tuple[Family, ...]) -> None:
     """Reject fields that are set twice."""
     scenarios = tune.scenarios
-    parts = {"spread": scenarios.spread, "machines": scenarios.machines, "each": scenarios.each}
+    parts: dict[str, Mapping[str, object]] = {
+        "spread": scenarios.spread,
+        "machines": scenarios.machines,
+        "each": scenarios.each,
+    }
     named = [(part, name) for part, names in parts.items() for name in names]
     for (one, name), (other, second) in combinations(named, 2):
         if overlaps(name, second):
@@ -487,7 +504,9 @@ def label(name: str) -> str:
     return re.sub(r"[^a-z0-9.]+", "_", name.lower()).strip("_.")
 
 
-def _family(name: str, written: Any, tune: Tune, study: Study, free: FreeNumbers) -> Family:
+def _family(
+    name: str, written: FamilySection, tune: Tune, study: Study, free: FreeNumbers
+) -> Family:
     path = f"tune.families.{shown_name(name)}"
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9 _.,+=()'-]{0,59}", name):
         raise field_error(
@@ -495,11 +514,7 @@ def _family(name: str, written: Any, tune: Tune, study: Study, free: FreeNumbers
             name,
             "names of up to 60 letters a to z, digits, spaces and _.,+=()'-, not first a sign",
         )
-    if not isinstance(written, dict) or not set(written) <= {"free", "set"}:
-        raise field_error(path, written, "{free = [names], set = {field = value}}")
-    names = written.get("free", list(tune.free))
-    if not isinstance(names, list) or not all(isinstance(free_name, str) for free_name in names):
-        raise field_error(f"{path}.free", names, "a list of names of tune.free")
+    names = tuple(tune.free) if written.free is None else written.free
     for free_name in names:
         if free_name not in tune.free:
             hint = nearest(free_name, tune.free)
@@ -507,11 +522,8 @@ def _family(name: str, written: Any, tune: Tune, study: Study, free: FreeNumbers
                 f"{path}.free: {free_name!r} is not in tune.free"
                 + (f"; did you mean {hint!r}?" if hint else "")
             )
-    changes = written.get("set", {})
-    if not isinstance(changes, dict):
-        raise field_error(f"{path}.set", changes, "{field = value}")
     columns, own = {}, study
-    for field, value in changes.items():
+    for field, value in written.set.items():
         known_field(field, own, f"{path}.set")
         columns[field] = checked_value(own, field, value, f"{path}.set.{shown_name(field)}")
         own = parse_study(set_value(own, field, columns[field]))
@@ -519,7 +531,7 @@ def _family(name: str, written: Any, tune: Tune, study: Study, free: FreeNumbers
     parts = parts_of(study, columns)
     is_other = np.array([not parts.owns(number.key) for number in free.numbers])
     for number, is_asked, is_wrong in zip(free.numbers, is_free, is_other, strict=True):
-        if "free" in written and is_asked and is_wrong:
+        if written.free is not None and is_asked and is_wrong:
             raise StudyError(
                 f"{path}.free: {number.key!r}: the family's control.law is {parts.law!r}, its "
                 f"drive.kind {parts.drive!r}"
@@ -530,8 +542,7 @@ def _family(name: str, written: Any, tune: Tune, study: Study, free: FreeNumbers
 
 def _parts(tune: Tune, study: Study) -> tuple[Parts, ...]:
     """Laws and drives that designs have, each combination once."""
-    changes = [x.get("set") for x in tune.families.values() if isinstance(x, dict)]
-    every = [parts_of(study), *(parts_of(study, x) for x in changes if isinstance(x, dict))]
+    every = [parts_of(study), *(parts_of(study, x.set) for x in tune.families.values())]
     return tuple(dict.fromkeys(x for x in every if x.law in LAWS and x.drive in DRIVES))
 
 
@@ -539,24 +550,19 @@ def _front(tune: Tune, families: list[Family]) -> list[Family]:
     """A family for each point of the front."""
     if not tune.pareto:
         return []
-    if set(tune.pareto) - {"limit", "values", "family"} or "limit" not in tune.pareto:
-        raise field_error("tune.pareto", tune.pareto, "{limit, values, family}")
-    limit, values = tune.pareto["limit"], tune.pareto.get("values")
+    limit, values = tune.pareto.limit, tune.pareto.values
     metrics = [name for name in tune.limits if name not in LOOP_LIMITS]
-    if not isinstance(limit, str) or limit not in metrics:
+    if limit not in metrics:
         allowed = "one of the metrics in tune.limits" + (
             f": {', '.join(metrics)}" if metrics else ""
         )
         raise field_error("tune.pareto.limit", limit, allowed)
-    if not isinstance(values, list) or len(values) < 2:
-        raise field_error("tune.pareto.values", values, "a list of two limits or more")
     for k, value in enumerate(values):
-        _check_positive(value, 1e30, f"tune.pareto.values[{k}]")
         if value in values[:k]:
             raise field_error(f"tune.pareto.values[{k}]", value, "each limit once")
     moving = {family.name: family for family in families if family.is_free.any()}
-    name = tune.pareto.get("family", next(iter(moving)))
-    if not isinstance(name, str) or name not in moving:
+    name = tune.pareto.family or next(iter(moving))
+    if name not in moving:
         raise field_error("tune.pareto.family", name, "one of " + ", ".join(moving))
     base = moving[name]
     return [
