@@ -72,7 +72,7 @@ def test_a_bad_file_is_refused(sections, message):
 
 def test_a_tuning_is_on_the_machines_of_the_fit():
     measured = parse_measured(data(tune={"starts": 2}, commission={"gain_margin": 3.0}))
-    machines = {"link.damping_ratio": np.linspace(0.01, 0.02, 20).tolist()}
+    machines = {"link.damping_ratio": tuple(np.linspace(0.01, 0.02, 20).tolist())}
     section = tuning_section(measured, measured.study, machines, 1.1)
     spec = parse_tuning(measured.study.model_dump() | {"tune": section})
     assert spec.tune.starts == 2

@@ -306,7 +306,7 @@ REFUSED = [
     (range_of(to=1), "sweep.axes.gain.to = 1.0; allowed: more than sweep.axes.gain.from = 1"),
     (range_of(to=float("inf")), "sweep.axes.gain.to = inf; allowed: a finite number"),
     (range_of(to=1e9), "control.gain_factor = 1000000000.0; allowed: a finite number >= 0 and <="),
-    (range_of(frm=1), "did you mean 'from'?"),
+    (range_of(frm=1), "did you mean 'sweep.axes.gain.from'?"),
     (range_of(scale="lg"), "allowed: 'linear' or 'log'"),
     (
         range_of(scale="log")
@@ -322,7 +322,7 @@ REFUSED = [
     ({"axes": {"control.velocity_gain": [[1.0, 2.0]]}}, "allowed: 3 finite numbers"),
     ({"axes": {"shaper": ["ie"]}}, "shaper.kind = 'ie'; allowed"),
     ({"axes": {"link_subsets": ["1+4"]}}, "sweep.axes.link_subsets = '1+4'; allowed: none, 1"),
-    ({"axes": {"placement": "all"}}, "sweep.axes.placement = 'all'; allowed: a table"),
+    ({"axes": {"placement": "all"}}, "sweep.axes.placement = 'all'; allowed: a section with"),
     ({"axes": {"placement": {"kind": "mirored"}}}, "did you mean 'mirrored'?"),
     ({"axes": {"placement": {"kind": "same"}}}, "a range needs count"),
     ({"axes": {"frequency_error": [-1.5]}}, "allowed: more than -1"),
@@ -363,7 +363,7 @@ REFUSED = [
     ({"axes": {"placement": {"candidates": 2}}}, "so many that 3 patches fit on them apart"),
     (range_of(to=10**400), "allowed: a finite number"),
     ({"axes": {"frequency_error": [10**400]}}, "allowed: a list of finite numbers"),
-    ({"axes": {"patches.centers[0]": {"from": -1e308, "to": 1e308, "count": 3}}}, "up to 1e150"),
+    ({"axes": {"patches.centers[0]": {"from": -1e308, "to": 1e308, "count": 3}}}, "<= 1e+150"),
     ({"axes": {"x" * 9999: [1]}}, "unknown field"),
     ({"axes": {"a\nb": [1]}}, "unknown field"),
     ({"axes": {"link.joint_inertia_b": [0.0, 1e-5]}}, "link.basis = 'pinned_pinned'; allowed"),

@@ -472,7 +472,7 @@ def test_designs_are_handed_on_along_a_front():
     levels = [
         base._replace(name=str(v), limits={"peak_voltage": v}, front="known") for v in (0.4, 0.9)
     ]
-    tune = spec.tune.model_copy(update={"pareto": {"limit": "peak_voltage"}})
+    tune = spec.tune.model_copy(update={"pareto": SimpleNamespace(limit="peak_voltage")})
     spec = spec._replace(families=tuple(levels), tune=tune)
     evaluator = Known(spec, lambda v: 2 + jax.numpy.cos(14 * v[0]) - v[0])  # a valley each
     plain = evaluator.evaluate
@@ -486,7 +486,7 @@ def test_designs_are_handed_on_along_a_front():
     evaluator.evaluate = evaluate
     at = begin(spec, evaluator)
     place = np.array([[0.2], [0.25], [0.21], [0.22]])  # the second family is in the wrong valley
-    single = spec._replace(tune=tune.model_copy(update={"pareto": {}}))
+    single = spec._replace(tune=tune.model_copy(update={"pareto": None}))
     alone = optimise(single, evaluator, at._replace(place=place), lambda at: None)
     better = np.array([[0.2], [0.25], [0.21], [0.68]])
     handed = optimise(spec, evaluator, at._replace(place=better), lambda at: None)
