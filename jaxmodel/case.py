@@ -66,7 +66,7 @@ class Structure(NamedTuple):
 
     @property
     def n_coordinates(self) -> int:
-        """Coordinates of a link: its modes, and its elongation if it has one."""
+        """Coordinates of a link, which are its modes and, if it has one, its elongation."""
         return self.n_modes + self.has_stretch
 
     @property
@@ -99,7 +99,7 @@ class Structure(NamedTuple):
 
     @property
     def plant_steps(self) -> int:
-        """Plant steps in a sample: `substeps`, before and after a command changes."""
+        """Plant steps in a sample, `substeps` before and as many after a command changes."""
         return self.substeps * (2 if self.is_delayed else 1)
 
 
