@@ -23,15 +23,18 @@ from jaxmodel.metrics import METRICS
 from studies.cli import VERBS, app
 from studies.commission.spec import Commission
 from studies.documents import DOCUMENTS, schema
-from studies.fitting.spec import ENTRIES, Fit, Next
+from studies.fitting.spec import ENTRIES, Fit, Next, WrittenPrior
+from studies.space.axes import WrittenGrid, WrittenPlacement, WrittenRange
+from studies.space.machines import UNCERTAIN
 from studies.space.spec import Block, Sweep
 from studies.study.cases import build_structure
-from studies.study.explain import allowed_values, unit_of
+from studies.study.explain import allowed_values, unit_of, written_fields
 from studies.study.numbers import form_of, one_study
 from studies.study.paths import field_choices
 from studies.study.spec import OWN_FIELDS, Study, paper_study
 from studies.study.template import toml_value
-from studies.tuning.spec import Scenarios, Tune
+from studies.tuning.free import FreePlacement
+from studies.tuning.spec import FamilySection, Pareto, Scenarios, Tune
 
 #: Words for the value of an option.
 _VALUES = {bool: "", int: "whole number", float: "number", str: "text"}
@@ -135,11 +138,18 @@ def fields_text() -> str:
         "## A sweep",
         _section_text("[sweep] and [[sweep.blocks]]", Block),
         _section_text("[sweep]", Sweep, own),
+        _section_text("A range of an axis", WrittenGrid),
+        _section_text("The axis placement", WrittenPlacement),
         "## A tuning",
         _section_text("[tune]", Tune),
+        _section_text("A range in [tune.free]", WrittenRange),
+        _section_text("placement in [tune.free]", FreePlacement),
+        _section_text("[tune.families.NAME]", FamilySection),
+        _section_text("[tune.pareto]", Pareto),
         _section_text("[tune.scenarios]", Scenarios),
         "## A fit",
         _section_text("[fit]", Fit),
+        _section_text("A range in [fit.free]", WrittenPrior),
         _section_text("[fit.next]", Next),
     ]
     parts += [_section_text(f'[[fit.data]], kind = "{kind}"', x) for kind, x in ENTRIES.items()]
@@ -153,7 +163,7 @@ def _is_section(annotation: Any) -> bool:
 
 def _section_text(name: str, section: type[BaseModel], fields: Fields | None = None) -> str:
     meaning = (section.__doc__ or "").strip()
-    return f"### `{name}`\n\n{meaning}\n\n{_fields_table(fields or section.model_fields)}"
+    return f"### `{name}`\n\n{meaning}\n\n{_fields_table(fields or written_fields(section))}"
 
 
 def _fields_table(fields: Fields) -> str:
@@ -210,6 +220,22 @@ def metrics_text() -> str:
     return table(("metric", "meaning", "unit", "axes"), rows)
 
 
+def machines_text() -> str:
+    """What nobody knows exactly of a machine."""
+    rows = (
+        (
+            f"`{x.field}`",
+            "" if x.tolerance is None else f"`{name}`",
+            "" if x.tolerance is None else f"{x.tolerance:g} [{x.unit}]",
+            x.why,
+            f"{x.percent:g} %" if x.percent else "",
+            f"{x.proven[0]:g} to {x.proven[1]:g}" if x.proven else "",
+        )
+        for name, x in UNCERTAIN.items()
+    )
+    return table(("field", "`--tolerance`", "one unit", "why", "laws", "proofs"), rows)
+
+
 # results
 
 
@@ -258,6 +284,7 @@ def _kind(rule: dict[str, Any]) -> tuple[str, dict[str, Any] | None]:
 TEXTS: dict[str, Callable[[], str]] = {
     "commands": commands_text,
     "fields": fields_text,
+    "machines": machines_text,
     "metrics": metrics_text,
     "results": results_text,
     "verbs": verbs_text,

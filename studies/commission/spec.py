@@ -19,7 +19,7 @@ from studies.export.run import DAC_BITS
 from studies.export.targets import TARGETS
 from studies.fitting.spec import FitSpec, parse_fit
 from studies.laws.candidates import RATIOS, law_candidate
-from studies.spillover.plants import MISMATCHES
+from studies.space.machines import MISMATCHES
 from studies.study.explain import explain
 from studies.study.files import find_spec, read_toml
 from studies.study.spec import Section, Study, described

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,65 +20,17 @@ from studies.engine.controller import FixedController
 from studies.engine.host_loop import SampledLoop, name_motion
 from studies.engine.nearest import Loops, nearest_unstable
 from studies.engine.programs import kept_jit
-from studies.errors import StudyError, field_error, nearest
+from studies.errors import StudyError
 from studies.results.breaking import BreakingChange, ChangedNumber
+from studies.space.machines import TOLERANCES
 from studies.threads import serial_blas
 
-#: One unit of each kind of change: how far it may well be off on a machine as built, in the units
-#: of `MachineChange`; of relative changes the natural logarithm of the factor.
-TOLERANCES = MachineChange(
-    stiffness=0.05,  # thickness within 1.7 %
-    damping=0.2,  # seldom known better
-    payload=0.02,  # [kg]
-    patch=1e-3,  # glued by hand [m]
-    delay=0.25,  # [samples]
-    actuator=0.05,  # d31 of one batch
-    sensor=0.05,
-    joint_inertia=1e-6,  # [kg m2]
-)
-#: Units of them.
-UNITS = MachineChange(
-    stiffness="1",
-    damping="1",
-    payload="kg",
-    patch="m",
-    delay="samples",
-    actuator="1",
-    sensor="1",
-    joint_inertia="kg m2",
-)
 #: Largest logarithm of a factor: twenty times as much, or as little [1].
 MOST = 3.0
 #: Largest share of the platform's mass that is taken off [1].
 LIGHTER = 0.5
 #: Smaller parts are not counted [tolerances].
 SMALL = 0.1
-
-
-def parse_tolerances(given: Mapping[str, float | str] | None) -> MachineChange:
-    """`TOLERANCES` with others by their names; 0: this number does not change.
-
-    Raises:
-        StudyError: unknown name, or no number from 0.
-    """
-    tolerances = TOLERANCES
-    for name, value in (given or {}).items():
-        if name not in MachineChange._fields:
-            allowed = f"{', '.join(MachineChange._fields)}, each as NAME=VALUE"
-            raise field_error(
-                "--tolerance", name, allowed, hint=nearest(name, MachineChange._fields)
-            )
-        try:
-            number = float(value)
-        except ValueError:
-            number = np.nan
-        if not 0 <= number < np.inf:
-            unit = getattr(UNITS, name)
-            raise field_error(f"--tolerance {name}", value, "a number from 0", unit)
-        tolerances = tolerances._replace(**{name: number})
-    if not any(tolerances):
-        raise StudyError("--tolerance: all are 0; allowed: at least one number that may change")
-    return tolerances
 
 
 def smallest_change(

@@ -82,7 +82,7 @@ class Next(Section):
 
 
 class WrittenPrior(WrittenRange):
-    """Bounds of a free number, and what is known of it beforehand."""
+    """Bounds of a parameter, and what is known of it beforehand."""
 
     mean: Finite | None = described(None, "", "most likely value, beside sigma")
     sigma: Finite | None = described(None, "", "its standard deviation")

@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import numpy as np
 
+from studies.space.machines import SPREAD, drawn_machines
 from studies.study.paths import known_field
 from studies.study.spec import Study
-
-#: Fields that differ among machines, and by how many percent at most; those that are 0 stay 0.
-SPREAD = {
-    "link.stiffness_factor": 5.0,
-    "machine.platform_mass": 20.0,
-    "load.mass": 20.0,
-    "link.joint_inertia_b": 20.0,
-    "link.joint_inertia_c": 20.0,
-}
 
 
 def spread_of(study: Study) -> dict[str, float]:
@@ -42,20 +35,17 @@ def machines_of(study: Study, count: int, seed: int) -> list[dict[str, Any]]:
         count: how many machines.
         seed: of the draw.
     """
-    from scipy.stats import qmc
-
-    spread = spread_of(study)
-    sizes = {name: study.n_links if name.startswith("link.") else 1 for name in spread}
-    points = qmc.LatinHypercube(sum(sizes.values()), rng=seed).random(count)
+    spread, links = spread_of(study), range(study.n_links)
+    entries = {
+        name: [f"{name}[{i}]" for i in links] if name.startswith("link.") else [name]
+        for name in spread
+    }
+    each = {entry: spread[name] for name, own in entries.items() for entry in own}
+    columns = drawn_machines(study, each, count, seed)
     machines: list[dict[str, Any]] = [{"run.seed": study.run.seed + 1 + k} for k in range(count)]
-    first = 0
-    for name, size in sizes.items():
-        factor = 1 + spread[name] / 100 * (2 * points[:, first : first + size] - 1)
-        first += size
-        value = known_field(name, study, "laws")
-        each = factor * (study.each_link(value) if size > 1 else value)
-        for machine, row in zip(machines, each.tolist(), strict=True):
-            machine[name] = row if size > 1 else row[0]
+    for (name, own), (k, machine) in product(entries.items(), enumerate(machines)):
+        row = [float(columns[entry][k]) for entry in own]
+        machine[name] = row if name.startswith("link.") else row[0]
     for machine in machines:
         machine["drive.model_mass"] = _known_mass(study, machine)
     return machines

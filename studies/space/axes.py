@@ -178,7 +178,7 @@ class WrittenRange(Section):
 
 
 class WrittenGrid(WrittenRange):
-    """The same with points on a grid."""
+    """Numbers from low to high, perhaps on a grid, as files write them."""
 
     count: int = described(0, "1", "of points for grid and zip; 0: none", ge=0, le=LIMIT)
 

@@ -16,15 +16,9 @@ from studies.errors import StudyError, field_error
 from studies.result import Result
 from studies.results.breaking import BreakingChange
 from studies.results.labelled import Labelled, Records, derived, labelled, told, unwritten
+from studies.space.machines import MISMATCHES, ModelMismatch
 from studies.spillover.fast_move import ControlEffect
-from studies.spillover.plants import (
-    MISMATCHES,
-    LoopBuilder,
-    ModelMismatch,
-    all_plants,
-    pad_channels,
-    plant_sizes,
-)
+from studies.spillover.plants import LoopBuilder, all_plants, pad_channels, plant_sizes
 from studies.spillover.proofs import Proofs, machine_text
 from studies.study.margin import hysteresis_text, margin_text
 from studies.study.spec import Study

@@ -6,7 +6,6 @@ their modal basis and one mismatch each from the controller's model.
 
 from __future__ import annotations
 
-from itertools import product
 from typing import NamedTuple
 
 import jax
@@ -28,45 +27,13 @@ from studies.engine.controller import FixedController
 from studies.engine.host_loop import SampledLoop, sampled_loop
 from studies.engine.programs import kept_jit
 from studies.errors import field_error
+from studies.space.machines import ModelMismatch as ModelMismatch
+from studies.space.machines import patch_lengths as patch_lengths
 
 #: Plant modes per link at most.
 LARGEST = MARGIN_MODES
 #: Beyond the controlled modes: margins have converged, and what remains of that is seen.
 SIZES = (8, LARGEST)
-
-
-class ModelMismatch(NamedTuple):
-    """How a plant departs from the controller's model."""
-
-    sensor: float = 1.0  # true sensor length over the one in the controller's model [1]
-    actuator: float = 1.0  # the same for actuators [1]
-    frequency: float = 1.0  # true frequencies of the bare links over those of the study [1]
-    joint_inertia: float | None = None  # true J_C [kg m2]; None: the study's
-
-    def __str__(self) -> str:
-        words = []
-        if (self.sensor, self.actuator) != (1, 1):
-            words.append(f"sensors x {self.sensor:g}, actuators x {self.actuator:g}")
-        if self.frequency != 1:
-            words.append(f"frequencies x {self.frequency:g}")
-        if self.joint_inertia is not None:
-            words.append(f"J_C = {self.joint_inertia:g} kg m2")
-        return ", ".join(words) or "as modelled"
-
-
-def patch_lengths(lengths: tuple[float, ...]) -> tuple[ModelMismatch, ...]:
-    """Sensors and actuators with these lengths relative to the model's [1]."""
-    return tuple(ModelMismatch(*pair) for pair in product(lengths, repeat=2))
-
-
-#: Possible mismatches: patches, the links' stiffness, the joints (none, and as measured).
-MISMATCHES = (
-    *patch_lengths((0.8, 1.0, 1.25)),
-    ModelMismatch(frequency=0.9),
-    ModelMismatch(frequency=1.1),
-    ModelMismatch(joint_inertia=0.0),
-    ModelMismatch(joint_inertia=1.1e-5),
-)
 
 
 class PlantVariant(NamedTuple):

@@ -23,6 +23,7 @@ from studies.engine.eigenvalues import eigenvalues
 from studies.engine.programs import kept_jit
 from studies.engine.stability import gain_margin
 from studies.results.labelled import Labelled, derived, told, unwritten
+from studies.space.machines import BOX
 from studies.spillover.plants import (
     LARGEST,
     LoopBuilder,
@@ -37,9 +38,6 @@ from studies.threads import serial_blas
 SINES = "pinned_pinned"
 #: Modes of a link that are known one by one.
 KNOWN = 200
-#: Ranges of the box: factor on the links' stiffness [1], extra delay [samples], payload beyond the
-#: study's [kg].
-BOX = ((0.95, 1.05), (0.0, 1.0), (0.0, 0.1))
 #: Shares of the margin of the base modes that are tried one after the other [1].
 SHARES = (0.3, 0.6, 0.8, 0.9, 0.93, 0.95, 0.96, 0.97, 0.98, 0.99)
 #: Slices of the unit circle to begin with; cells at most for a share, and for a box.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from jaxmodel.beam import BASES
 from jaxmodel.changes import MachineChange
-from studies.engine.breaking import TOLERANCES, smallest_change
+from studies.engine.breaking import smallest_change
 from studies.engine.controller import fixed_controller
 from studies.engine.run_data import run_attributes
 from studies.errors import StudyError
@@ -14,6 +14,7 @@ from studies.result import in_folder
 from studies.results.document import json_text
 from studies.results.labelled import variables
 from studies.show.pages import write_report
+from studies.space.machines import TOLERANCES
 from studies.spillover.certificate import Certificate, certify
 from studies.spillover.fast_move import ControlEffect, run_fast_move
 from studies.spillover.proofs import prove

@@ -6,12 +6,12 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.laws import LAWS
-from studies.engine.breaking import UNITS
 from studies.engine.fast_motion import FAST, WINDOW
 from studies.show.listing import Rows
 from studies.show.report import Chapter, Items, Report, chapter, drawing, machine
 from studies.show.units import span
 from studies.show.words import motion_text
+from studies.space.machines import UNITS
 from studies.spillover import plots
 from studies.spillover.certificate import Certificate
 from studies.spillover.fast_move import ControlEffect

@@ -52,10 +52,10 @@ def certify(
     Example:
         >>> certify("spillover").verdict  # doctest: +SKIP
     """
-    from studies.engine.breaking import parse_tolerances
     from studies.engine.design import as_design
     from studies.engine.runs import resolved_study
     from studies.job import make_request, working
+    from studies.space.machines import parse_tolerances
     from studies.spillover.run import DECISIVE, certified, phases
 
     study = resolved_study(as_design(what, case).study)

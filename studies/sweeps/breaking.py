@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-from studies.engine.breaking import parse_tolerances, smallest_change
+from studies.engine.breaking import smallest_change
 from studies.engine.controller import fixed_controller
 from studies.engine.design import load_design
 from studies.errors import StudyError
 from studies.results.breaking import BrokenCase
+from studies.space.machines import parse_tolerances
 
 
 def breaking_changes(

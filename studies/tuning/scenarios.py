@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy
 
 from studies.engine.chunks import distinct_loops
 from studies.show.units import count_text
+from studies.space.machines import drawn_machines
 from studies.study.cases import build_structure
 from studies.study.fields import Columns, column_of
 from studies.study.numbers import build_cases
@@ -36,11 +36,9 @@ def scenario_columns(
     is_own = (np.arange(count) == 0) & (not is_fresh)
     machines = {"run.seed": np.where(is_own, spec.study.run.seed, noise)}
     if spread:
-        shift = 2 * scipy.stats.qmc.LatinHypercube(len(spread), rng=seed).random(count) - 1
-        shift[is_own] = 0.0
-        for k, (name, percent) in enumerate(spread.items()):
-            share = 1 + percent / 100 * shift[:, k]
-            machines[name] = np.multiply.outer(share, known_field(name, spec.study))
+        machines |= drawn_machines(spec.study, spread, count, seed)
+    for name in spread:
+        machines[name][is_own] = known_field(name, spec.study)
     for name, values in spec.tune.scenarios.machines.items():
         baseline = [] if is_fresh else [known_field(name, spec.study)]
         column = [as_tuples(x) for x in baseline + others(values, count, is_fresh)]

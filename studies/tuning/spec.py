@@ -98,7 +98,7 @@ class FamilySection(Section):
 
 
 class Pareto(Section):
-    """A front: the tuning again and again with another limit."""
+    """A Pareto front: the tuning again and again with another limit."""
 
     limit: str = described(..., "-", "a metric in tune.limits")
     values: tuple[Positive, ...] = described(..., "-", "its limits", min_length=2)

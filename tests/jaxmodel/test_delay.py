@@ -20,8 +20,8 @@ from jaxmodel.sampled_loop import closed_loop
 from jaxmodel.simulate import simulate
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
+from studies.space.machines import ModelMismatch
 from studies.spillover.certificate import certify
-from studies.spillover.plants import ModelMismatch
 from studies.study.cases import build_structure
 from studies.tuning.optimise import optimise
 from studies.tuning.run import make_evaluator

@@ -38,10 +38,10 @@ from studies.export.in_the_loop import replay
 from studies.export.integers import respond as respond_fixed
 from studies.export.run import DAC_BITS
 from studies.export.verify import DOUBLE, _limits, compare_values, load_code
+from studies.space.machines import ModelMismatch
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table
 from studies.spillover.certificate import certify
-from studies.spillover.plants import ModelMismatch
 from studies.study.spec import load_study
 from studies.study.template import study_template
 from tests.bare import parse_study

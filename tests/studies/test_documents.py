@@ -15,13 +15,13 @@ from jaxmodel import status
 from studies.cli import app
 from studies.documents import DOCUMENTS, schema
 from studies.engine import results
-from studies.engine.breaking import TOLERANCES
 from studies.engine.design import Design
 from studies.errors import StudyError
 from studies.results.breaking import BreakingChange, ChangedNumber
 from studies.results.document import json_text
 from studies.results.labelled import Labelled, labelled, told
 from studies.single.verb import simulate
+from studies.space.machines import TOLERANCES
 from studies.sweeps.sensitivity import analyse
 from tests.studies.sweeps.test_sweep_tables import (
     DAMPING,

@@ -14,11 +14,12 @@ from jaxmodel.sampled_loop import analogue_plant, closed_loop
 from studies.commands import settings
 from studies.documents import schema
 from studies.engine import breaking
-from studies.engine.breaking import TOLERANCES, parse_tolerances, smallest_change
+from studies.engine.breaking import smallest_change
 from studies.engine.controller import fixed_controller
 from studies.engine.nearest import Loops, _pulled, growth, nearest_unstable
 from studies.errors import StudyError
 from studies.results.labelled import plain
+from studies.space.machines import TOLERANCES, parse_tolerances
 from studies.study.cases import as_arrays, build_case, build_structure
 from tests.canonical import MACHINE, study_of
 from tests.evolution import cma_es

@@ -11,9 +11,10 @@ from jaxmodel import status
 from studies.results.document import json_text
 from studies.results.labelled import plain
 from studies.show.pages import page
+from studies.space.machines import ModelMismatch
 from studies.spillover.certificate import Certificate
 from studies.spillover.fast_move import ControlEffect
-from studies.spillover.plants import ModelMismatch, PlantVariant
+from studies.spillover.plants import PlantVariant
 from studies.spillover.say import residual_text, say
 from studies.study.margin import margin_in_db
 from studies.tuning.audit import Disagreement

@@ -30,6 +30,7 @@ from studies.engine.controller import fixed_controller
 from studies.engine.stability import gain_margin
 from studies.results.document import json_text
 from studies.show.pages import page
+from studies.space.machines import BOX
 from studies.spillover import ModelMismatch, certify
 from studies.spillover import proofs as proofs_module
 from studies.spillover.plants import (
@@ -40,7 +41,6 @@ from studies.spillover.plants import (
     plant_structure,
 )
 from studies.spillover.proofs import (
-    BOX,
     KNOWN,
     SINES,
     AllModes,

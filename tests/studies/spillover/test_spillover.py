@@ -24,7 +24,6 @@ from jaxmodel.electronics import measurement_chain
 from jaxmodel.laws.lqr import optimal_gains
 from jaxmodel.laws.ppf import HIGHEST_RATIO, design_position_filter
 from studies.documents import schema
-from studies.engine.breaking import TOLERANCES
 from studies.engine.controller import fixed_controller
 from studies.engine.fast_motion import FAST, WINDOW, make_fast
 from studies.engine.runs import run_study
@@ -33,11 +32,12 @@ from studies.errors import StudyError
 from studies.results.breaking import BreakingChange, ChangedNumber
 from studies.results.labelled import document
 from studies.show import figures
+from studies.space.machines import BOX, TOLERANCES
 from studies.spillover import ModelMismatch, certificate, certify, patch_lengths
 from studies.spillover import run as spillover_run
 from studies.spillover.fast_move import run_fast_move
 from studies.spillover.plants import LoopBuilder, all_plants, pad_channels
-from studies.spillover.proofs import BOX, AllModes, Proofs, ProvenBox
+from studies.spillover.proofs import AllModes, Proofs, ProvenBox
 from studies.spillover.say import _largest
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.template import study_template
