@@ -49,20 +49,26 @@ class RingingPoles(NamedTuple):
         )
 
 
-def _observability(signals: np.ndarray) -> tuple[np.ndarray, int]:
-    """Columns that span what outputs can be seen in successive samples, (rows c, n), and c.
+def _realised(
+    signals: np.ndarray, rows: int, every: int, noise: float
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """What outputs can be seen in successive samples, in columns, and the states' course.
 
     Args:
         signals: free responses, (t, c, r).
+        rows: samples in a block column of their Hankel matrix.
+        every: how many samples a column is after the one before.
+        noise: singular values below this share of the largest are left out [1].
+
+    Returns:
+        (rows c, n), (n, columns), c.
     """
-    length, c, r = signals.shape
-    rows = max(min(length // 2, LARGEST // c), 2)
-    starts = np.arange(0, length - rows + 1, -(-(length - rows + 1) * r // LARGEST))
+    starts = np.arange(0, len(signals) - rows + 1, every)
     windows = np.lib.stride_tricks.sliding_window_view(signals, rows, axis=0)[starts]
-    hankel = windows.transpose(3, 1, 0, 2).reshape(rows * c, -1)
-    left, size, _ = np.linalg.svd(hankel, full_matrices=False)
-    kept = slice(min(ORDERS[-1], int(np.sum(size > EXACT * size[0]))))
-    return left[:, kept], c
+    hankel = windows.transpose(3, 1, 2, 0).reshape(rows * signals.shape[1], -1)
+    left, size, right = np.linalg.svd(hankel, full_matrices=False)
+    kept = size > noise * size[0]
+    return left[:, kept], size[kept, None] * right[kept], signals.shape[1]
 
 
 def _transition(seen: np.ndarray, c: int) -> np.ndarray:
@@ -70,9 +76,26 @@ def _transition(seen: np.ndarray, c: int) -> np.ndarray:
     return np.asarray(np.linalg.lstsq(seen[:-c], seen[c:], rcond=None)[0])
 
 
+def ringing_poles(signals: np.ndarray, depth: int, noise: float) -> np.ndarray:
+    """Discrete poles in a free response [1], those of the largest amplitude at its end first.
+
+    Args:
+        signals: from some sample after the last excitation on, (t, c).
+        depth: samples in a block column.
+        noise: singular values below this share of the largest are noise [1].
+    """
+    seen, course, c = _realised(signals[..., None], depth, 1, noise)
+    value, vector = np.linalg.eig(_transition(seen, c))
+    last = np.linalg.lstsq(vector, course[:, -1].astype(complex), rcond=None)[0]
+    return np.asarray(value[np.argsort(-np.abs(last))])
+
+
 def find_orders(signals: np.ndarray, step: float, band: tuple[float, float]) -> list[RingingPoles]:
     """Poles within the band, order by order."""
-    seen, c = _observability(signals)
+    length, c, r = signals.shape
+    rows = max(min(length // 2, LARGEST // c), 2)
+    seen, _, c = _realised(signals, rows, -(-(length - rows + 1) * r // LARGEST), EXACT)
+    seen = seen[:, : ORDERS[-1]]
     found: list[RingingPoles] = []
     for n in ORDERS:
         if n > seen.shape[1] and found:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from studies.fitting.realisation import ringing_poles
 from studies.results.labelled import Labelled, labelled, told
 from studies.study.spec import Study
 from studies.twin.law import exported_law
@@ -16,7 +17,6 @@ from studies.twin.loop import TwinRun, run_twin
 from studies.twin.machine import MachineData
 from studies.twin.multibody import DEFAULT, Settings
 from studies.twin.plan import TwinPlan, resting
-from studies.twin.ringing import ringing_poles
 
 #: Voltage of the pulse, on every actuator with a sign of its own, for one sample [V]: for decay,
 #: and, so that what grows stays far below the actuators' limits, for growth.

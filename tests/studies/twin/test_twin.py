@@ -22,6 +22,7 @@ from studies.documents import schema
 from studies.engine.preflight import check_run
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
+from studies.fitting.realisation import ringing_poles
 from studies.reference.tables import BARE, frequencies
 from studies.results.document import json_text
 from studies.study.cases import as_arrays, build_case, build_structure
@@ -36,7 +37,6 @@ from studies.twin.mesh import damping_matrix, held_modes, mesh_link
 from studies.twin.multibody import Settings, build_model
 from studies.twin.plan import SignalPath
 from studies.twin.reading import Reader
-from studies.twin.ringing import ringing_poles
 from studies.twin.verb import twin
 from tests.jobs import quiet_job
 from tests.studies.test_cli import refused, run
