@@ -58,11 +58,11 @@ def needs_exudyn() -> None:
 
 
 def machine_of(**fields):
-    return describe_machine(*check_run(Study().change(**fields)))
+    return describe_machine(*check_run(Study().change(**BARE | fields)))
 
 
 def test_mesh_has_nodes_at_patch_ends_and_modes_of_a_pinned_beam():
-    link = machine_of(**BARE, patches__centers=(0.047, 0.101, 0.16)).links[0]
+    link = machine_of(patches__centers=(0.047, 0.101, 0.16)).links[0]
     mesh = mesh_link(link, 40)
     np.testing.assert_allclose(mesh.x[mesh.sensor_nodes], link.sensor_ends, atol=1e-12)
     np.testing.assert_allclose(mesh.x[mesh.actuator_nodes], link.actuator_ends, atol=1e-12)
@@ -259,7 +259,7 @@ def differences(study, settings, machine=None):
 
 def test_a_move_is_the_same_in_both_models_and_a_wrong_machine_is_noticed():
     needs_exudyn()
-    study = Study().change(**SHORT)
+    study = Study().change(**BARE | SHORT)
     found = differences(study, STIFF)
     assert np.all(found < [2e-3, 1e-3, 4e-3]), found
     machine = compare.TwinBench(study, STIFF).machine
@@ -273,7 +273,7 @@ def test_a_move_is_the_same_in_both_models_and_a_wrong_machine_is_noticed():
 
 def test_everything_a_study_can_have_is_in_the_twin():
     needs_exudyn()
-    found = differences(Study().change(**SHORT | EVERYTHING), STIFF)
+    found = differences(Study().change(**BARE | SHORT | EVERYTHING), STIFF)
     assert np.all(found < 1e-2), found
 
 
@@ -498,7 +498,7 @@ def test_each_change_has_the_differences_without_and_with_control(monkeypatch, s
 
 def test_the_command_writes_report_figure_and_numbers(tmp_path, capsys, monkeypatch):
     needs_exudyn()
-    study, job = Study().change(**SHORT), quiet_job(tmp_path, twin_run.PHASES)
+    study, job = Study().change(**BARE | SHORT), quiet_job(tmp_path, twin_run.PHASES)
     settings = STIFF._replace(n_elements=10, n_steps=8)
     result = twin_run.compared_with_twin(study, job, settings, has_changes=False)
     document = json.loads((tmp_path / "twin.json").read_text())
@@ -540,7 +540,7 @@ THREE = {
 )
 def test_the_square_is_the_same_in_both_models(fields, deflection, voltage, tmp_path):
     needs_exudyn()
-    study = Study().change(run__duration=0.5, metrics__residual_length=0.1, **fields)
+    study = Study().change(**BARE, run__duration=0.5, metrics__residual_length=0.1, **fields)
     result = twin(study, tmp_path, progress=False)
     changes = {one.text: one for one in result.causes}
     found = changes["as they are"]
