@@ -89,6 +89,12 @@ def paper_case(
             numbers[name] = _number(name, own, given.get(name, PAPERS))
     for name in given.keys() - numbers.keys():
         _refuse(name, numbers)
+    moves = len(numbers["motion.waypoints"]) - 1
+    for name in ("motion.move_time", "motion.dwell"):
+        if np.shape(numbers[name]) != (1,):
+            check_shape(name, numbers[name], (moves,))
+    if "machine.joint_angles_deg" in given:
+        check_shape("machine.joint_angles_deg", numbers["machine.joint_angles_deg"], links)
     n_patches = np.shape(numbers["patches.centers"])[-1]
     for name in _OF_PATCHES:
         factor = given.get(name, 1.0)
@@ -161,14 +167,15 @@ def _number(name: str, field: dict[str, Any], value: Any) -> Array:
             raise PartError(f"{name}: traced; expected a value that is known before")
         return _shaped(name, field.get("of"), own.shape, value)
     if "choices" in field:
-        if value not in field["choices"]:
+        if not isinstance(value, str) or value not in field["choices"]:
             _refuse(value, field["choices"], f"{name} = ")
         return np.array(field["choices"].index(value))
     try:
         array = np.asarray(value)
     except ValueError:  # lists of unequal length
         array = np.array(None)
-    if array.dtype.kind not in "biuf":
+    is_switch = field.get("is_whole", False)
+    if array.dtype.kind not in ("biuf" if is_switch else "iuf"):
         raise PartError(f"{name} = {value!r}; allowed: {field['allowed']}")
     if not (is_fine := _is_allowed(field, array)).all():
         unit = f" [{field['unit']}]" if field["unit"] else ""
@@ -190,7 +197,7 @@ def _shaped(name: str, of: str | None, own: tuple[int, ...], value: Any) -> Arra
         target = (own[0], *shape)
     is_flat = of in ("entries", "lists") and 0 < len(shape) < len(own)
     try:
-        if not is_flat and (shape or np.prod(target)):
+        if not is_flat and 0 not in shape and (shape or np.prod(target)):
             return xp.broadcast_to(value, target)
     except ValueError:
         pass

@@ -9,8 +9,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pydantic import ValidationError
-
 from jaxmodel.laws import LAWS
 from jaxmodel.metrics import METRICS
 from studies.errors import StudyError, field_error, nearest
@@ -19,11 +17,11 @@ from studies.export.run import DAC_BITS
 from studies.export.targets import TARGETS
 from studies.fitting.spec import FitSpec, parse_fit
 from studies.laws.candidates import RATIOS, law_candidate
+from studies.space.axes import parse_section
 from studies.space.machines import MISMATCHES
-from studies.study.explain import explain
 from studies.study.files import find_spec, read_toml
 from studies.study.spec import Section, Study, described
-from studies.tuning.spec import parse_tuning
+from studies.tuning.spec import Tune, parse_tuning
 
 #: Its section.
 SECTION = "commission"
@@ -103,10 +101,7 @@ def parse_measured(data: dict[str, Any], folder: str | Path = ".") -> MeasuredSp
     rest = {name: value for name, value in data.items() if name not in ("tune", SECTION)}
     fit = parse_fit(rest, folder)
     written = data.get(SECTION, {})
-    try:
-        commission = Commission.model_validate(written)
-    except ValidationError as error:
-        raise explain(error, Commission, written, inside=SECTION) from None
+    commission = parse_section(Commission, written, SECTION)
     targets = [name for name, x in TARGETS.items() if x.has_pil]
     _check_name("target", commission.target, targets)
     if commission.processor:
@@ -115,8 +110,7 @@ def parse_measured(data: dict[str, Any], folder: str | Path = ".") -> MeasuredSp
     if control.feedback != "sampled":
         raise field_error("control.feedback", control.feedback, "'sampled' for a controller")
     tune = data.get("tune", {})
-    if not isinstance(tune, dict):
-        raise field_error("tune", tune, "a section, as of studies tune")
+    parse_section(Tune, tune, "tune")
     if "machines" in tune.get("scenarios", {}):
         raise StudyError("tune.scenarios.machines: not allowed here; they are those of the fit")
     measured = MeasuredSpec(fit=fit, tune=tune, commission=commission, data=data)

@@ -291,4 +291,6 @@ def _entry(written: dict[str, object], k: int, study: Study) -> DataEntry:
             f"{path}: sigma or sigma_percent is missing; without it the data say nothing about "
             "uncertainty"
         )
+    if isinstance(entry, ModesEntry) and entry.link > study.n_links:
+        raise field_error(f"{path}.link", entry.link, f"1 to {study.n_links}", "1")
     return entry if entry.name else entry.model_copy(update={"name": f"{kind} {k + 1}"})

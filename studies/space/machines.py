@@ -126,7 +126,7 @@ def parse_tolerances(given: Mapping[str, float | str] | None) -> MachineChange:
             raise field_error("--tolerance", name, allowed, hint=hint)
         try:
             number = float(value)
-        except ValueError:
+        except (TypeError, ValueError, OverflowError):
             number = np.nan
         if not 0 <= number < np.inf:
             unit = getattr(UNITS, name)

@@ -188,12 +188,12 @@ def explain(
             break
         annotation, metadata = _plain(annotation, metadata)
         name = [*name, shown_name(str(part)) if isinstance(part, str) else part]
-        if not (is_missing and name and isinstance(value, dict) and part not in value):
-            value = value[part]
-        else:
+        is_there = not isinstance(value, dict) or part in value
+        if is_missing and not is_there:
             allowed = allowed_values(annotation, metadata, sizes)
             text = f"{_dotted(name)}: missing; allowed: {allowed}"
             return StudyError(f"{text} [{unit}]" if unit else text)
+        value = value[part] if is_there else fault["input"]  # of a key that is no text
     hint = nearest(value, _choices_within(annotation, metadata)) if isinstance(value, str) else ""
     allowed = allowed_values(annotation, metadata, sizes)
     return field_error(_dotted(name) or "study", value, allowed, unit, hint)
@@ -231,7 +231,7 @@ def _unknown(
 ) -> StudyError:
     section = _dotted(name)
     field = f"{section}.{leaf}".lstrip(".")
-    own = nearest(leaf, written_fields(model))
+    own = nearest(leaf, [*written_fields(model), *(() if section else COMMANDS)])
     close = (
         f"{section}.{own}".lstrip(".") if own else nearest_field(field, _fields(outermost, inside))
     )

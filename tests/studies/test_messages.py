@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from studies.commission.spec import parse_measured
+from studies.config import configure
 from studies.errors import StudyError
 from studies.fitting.spec import parse_fit
 from studies.space.spec import parse_sweep
@@ -43,5 +44,6 @@ def test_messages_are_word_for_word_as_they_were(kind):
 
 
 if __name__ == "__main__":
+    configure()
     rows = [[kind, data, said(kind, data)] for kind, data, _ in ROWS]
     FILE.write_text("".join(f"{json.dumps(row)}\n" for row in rows), encoding="utf-8")

@@ -24,7 +24,6 @@ from studies.study.numbers import one_study
 from studies.study.signals import Signal
 from studies.study.spec import Study
 
-#: No link under control.
 #: What a run records of each kind of output.
 RECORDED = {
     "sensor": "sensor_voltage",
