@@ -257,7 +257,7 @@ def _axes(node: BlockNode) -> list[str]:
 
 def _values_text(written: Any) -> str:
     """Values of an axis: a range as written, or each value in words."""
-    if isinstance(written, list):
+    if isinstance(written, list | tuple):
         texts = [value if isinstance(value, str) else shown(value) for value in written]
         more = f", ... ({len(texts)} values)" if len(texts) > MOST_VALUES else ""
         return ", ".join(texts[:MOST_VALUES]) + more

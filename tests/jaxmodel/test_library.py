@@ -299,7 +299,7 @@ def test_gradients_and_hessians_of_an_own_loss():
         step = 1e-4 * np.eye(9)[k]
         wanted = (loss(free + step) - loss(free - step)) / 2e-4
         assert float(slope[k]) == pytest.approx(float(wanted), rel=1e-5)
-    curvature = np.asarray(jax.jit(jax.hessian(own_loss))(free))
+    curvature = np.asarray(jax.jit(jax.jacfwd(jax.jacfwd(own_loss)))(free))
     assert np.isfinite(curvature).all() and np.abs(curvature).max() > 0
     np.testing.assert_allclose(curvature, curvature.T, atol=1e-8 * np.abs(curvature).max())
 
