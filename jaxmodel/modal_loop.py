@@ -13,11 +13,11 @@ import numpy as np
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, linear_law
 from jaxmodel.discs import Disc
-from jaxmodel.frequency_response import assembled, plant_response
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array, Num
 from jaxmodel.piezo import patch_ends
 from jaxmodel.prepare import prepare, stretch_of
+from jaxmodel.sampled_response import assembled, plant_response
 from jaxmodel.stretch import held_voltage
 
 

@@ -18,12 +18,12 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.delay import true_delay
 from jaxmodel.estimator import Estimator
-from jaxmodel.frequency_response import Assembled, PlantResponse, assembled, plant_response
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import Loop
 from jaxmodel.notch import Notch
 from jaxmodel.pairs import Pair, determinant, product
 from jaxmodel.parameters import Array, Num
+from jaxmodel.sampled_response import Assembled, PlantResponse, assembled, plant_response
 from jaxmodel.trigonometry import sine_cosine
 
 #: Images n of the spectrum that are summed; those left out change the sum by 1e-4.

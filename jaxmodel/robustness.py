@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxmodel.frequency_response import SampledLoopResponse, close_loop, command_gain
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop_figures import MOST_DELAY, MOST_PHASE, PEAKS
 from jaxmodel.parameters import Array, Num
 from jaxmodel.return_difference import NARROWEST, assembled_modes
+from jaxmodel.sampled_response import SampledLoopResponse, close_loop, command_gain
 from jaxmodel.scaling import best_scaling
 from jaxmodel.state_space import StateSpace
 

@@ -13,9 +13,9 @@ from scipy.optimize import minimize, minimize_scalar
 from test_notebooks import code_cells, read
 
 from jaxmodel.controller import linear_law
-from jaxmodel.frequency_response import controller_response
 from jaxmodel.numbers import case_of
 from jaxmodel.prepare import prepare
+from jaxmodel.sampled_response import controller_response
 from studies.engine.preflight import check_run
 from studies.single.plant import controller_of, plant_of
 from studies.study.numbers import one_study, position, put

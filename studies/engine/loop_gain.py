@@ -1,4 +1,4 @@
-"""L of many loops at many frequencies, by the compiled response of `jaxmodel.frequency_response`.
+"""L of many loops at many frequencies, by the compiled response of `jaxmodel.sampled_response`.
 
 Points of all loops go through one program, as many as there are, on this machine's cores.
 """
@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.controller import Controller
-from jaxmodel.frequency_response import SampledLoopResponse, command_gain, controller_response
 from jaxmodel.parameters import Array
+from jaxmodel.sampled_response import SampledLoopResponse, command_gain, controller_response
 from studies.engine.programs import kept_jit
 
 #: Points of a call at most, and those evaluated at once, which stay in a processor's cache.

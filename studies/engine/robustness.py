@@ -14,7 +14,6 @@ import jax
 import numpy as np
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.frequency_response import SampledLoopResponse, response_of_loop
 from jaxmodel.judge import with_margin_modes
 from jaxmodel.laws import LAWS
 from jaxmodel.loop import Loop
@@ -24,6 +23,7 @@ from jaxmodel.prepare import prepare
 from jaxmodel.return_difference import assembled_modes
 from jaxmodel.robustness import MarginPlace, norm_peaks
 from jaxmodel.sampled_loop import DelayedParts, delayed_parts
+from jaxmodel.sampled_response import SampledLoopResponse, response_of_loop
 from studies.config import hosts
 from studies.engine.crossings import delay_margins, phase_margins
 from studies.engine.delay_check import DelayedLoops, checked_delays

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.frequency_response import SampledLoopResponse, response_of_loop
 from jaxmodel.linear import resting
 from jaxmodel.linear_residual import linear_residual
 from jaxmodel.loop_figures import MARGINS, PEAKS
@@ -18,6 +17,7 @@ from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.robustness import MarginPlace, margin_at, norm_peaks
 from jaxmodel.sampled_loop import LoopMatrices, loop_matrices, slowest_decay, spillover
+from jaxmodel.sampled_response import SampledLoopResponse, response_of_loop
 from studies.engine.programs import kept_jit
 from studies.engine.robustness import response_and_modes
 from studies.tuning.loop_figures import distance_of_path

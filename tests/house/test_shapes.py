@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 from jaxtyping import AbstractArray, Num, Shaped, jaxtyped
 
-from jaxmodel.frequency_response import plant_response
 from jaxmodel.linear import linearise
 from jaxmodel.loop import step
 from jaxmodel.metrics import METRICS, Sizes
@@ -25,6 +24,7 @@ from jaxmodel.parameters import PerLink
 from jaxmodel.prepare import prepare
 from jaxmodel.return_difference import assembled_modes, loop_response
 from jaxmodel.sampled_loop import loop_matrices
+from jaxmodel.sampled_response import plant_response
 from jaxmodel.shaper import zvd
 from jaxmodel.simulate import begin, conclude
 from studies.study.cases import as_arrays, build_case, build_structure

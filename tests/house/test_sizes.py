@@ -40,7 +40,7 @@ OTHERS = {
     "jaxmodel/actuation.py": ("range(3)",),
     "jaxmodel/damping.py": ("np.ones(6)",),
     "jaxmodel/dynamics.py": ("len(m) == 3",),
-    "jaxmodel/frequency_response.py": ("range(3)",),
+    "jaxmodel/sampled_response.py": ("range(3)",),
     "jaxmodel/laws/contract.py": (":3",),
     "jaxmodel/laws/ppf.py": ("(zero,) * 3",),
     "jaxmodel/loop.py": ("range(3)",),

@@ -12,11 +12,11 @@ from jaxmodel.case import Structure
 from jaxmodel.delay import LONGEST, command_change
 from jaxmodel.drives import DRIVES
 from jaxmodel.electronics import measurement_chain
-from jaxmodel.frequency_response import command_gain, response_of_loop
 from jaxmodel.pairs import Pair
 from jaxmodel.prepare import prepare
 from jaxmodel.return_difference import delayed
 from jaxmodel.sampled_loop import closed_loop
+from jaxmodel.sampled_response import command_gain, response_of_loop
 from jaxmodel.simulate import simulate
 from studies.engine.stability import loop_report
 from studies.errors import StudyError

@@ -6,8 +6,8 @@ import pytest
 
 from jaxmodel.defaults import HOME
 from jaxmodel.drive import late_response
-from jaxmodel.frequency_response import command_gain, controller_response, response_of_loop
 from jaxmodel.linear import linearise, mass_and_stiffness, natural_modes
+from jaxmodel.sampled_response import command_gain, controller_response, response_of_loop
 from studies.engine.loop_gain import loop_gains
 from studies.engine.margins import judge_loops
 from studies.engine.preflight import check_run

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -351,3 +352,10 @@ def test_every_public_function_has_an_example_that_runs(name):
     said = []
     doctest.DocTestRunner().run(test, out=said.append)
     assert not said, "".join(said)
+
+
+def test_no_module_has_the_name_of_something_public():
+    """Importing it would put the module in the place of the function."""
+    homes = {name: getattr(jaxmodel, name).__module__ for name in FUNCTIONS}
+    modules = {x.stem for x in Path(jaxmodel.__file__).parent.glob("*.py")}
+    assert {x for x, home in homes.items() if x in modules and home != f"jaxmodel.{x}"} == set()

@@ -11,13 +11,13 @@ from jaxmodel import kinematics, status
 from jaxmodel.axial import stretch_error
 from jaxmodel.case import uncontrolled
 from jaxmodel.defaults import paper_machine
-from jaxmodel.frequency_response import assembled, plant_response
 from jaxmodel.linear import linearise
 from jaxmodel.mechanisms import MECHANISMS
 from jaxmodel.mechanisms.check import check_mechanism
 from jaxmodel.mechanisms.five_bar.cranks import FiveBarGeometry
 from jaxmodel.mechanisms.rrr.cranks import CrankGeometry
 from jaxmodel.prepare import prepare
+from jaxmodel.sampled_response import assembled, plant_response
 from jaxmodel.table import PartError
 from studies.engine.runs import _simulate, run_study
 from studies.engine.stability import loop_report

@@ -8,7 +8,7 @@ import pytest
 from scipy.io import loadmat
 
 from jaxmodel.defaults import HOME
-from jaxmodel.frequency_response import controller_response
+from jaxmodel.sampled_response import controller_response
 from studies.engine.preflight import check_run, preflight
 from studies.engine.stability import loop_report
 from studies.errors import StudyError

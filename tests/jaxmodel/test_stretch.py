@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from jaxmodel import sampled_loop
-from jaxmodel.frequency_response import IMAGES, image_weights, plant_images, plant_response
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import closed_loop, sampled_plant
+from jaxmodel.sampled_response import IMAGES, image_weights, plant_images, plant_response
 from jaxmodel.simulate import begin, simulate
 from jaxmodel.stretch import find_stretch, held_voltage
 from studies.engine.margins import judge_loops

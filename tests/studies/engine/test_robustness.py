@@ -13,12 +13,12 @@ import pytest
 from scipy.linalg import expm
 from scipy.optimize import brentq, minimize, minimize_scalar
 
-from jaxmodel.frequency_response import close_loop, command_gain
 from jaxmodel.linear import linearise, resting
 from jaxmodel.loop_figures import MARGINS, MOST_DELAY, PEAKS, guaranteed_range
 from jaxmodel.prepare import prepare
 from jaxmodel.robustness import _refined, coarse_norm, margin_at, norm_peaks, search_frequencies
 from jaxmodel.sampled_loop import analogue_plant, closed_loop, delayed_loop
+from jaxmodel.sampled_response import close_loop, command_gain
 from jaxmodel.scaling import best_scaling
 from studies.engine import diagonal_scaling, robustness
 from studies.engine.delay_check import DelayedLoops

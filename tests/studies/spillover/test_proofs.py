@@ -15,15 +15,15 @@ from jaxmodel import zero_exclusion
 from jaxmodel.branch_and_bound import Cells, exclude_zeros, start_cells
 from jaxmodel.controller import with_gains
 from jaxmodel.discs import Disc, excludes_zero, interval, inverse_of
-from jaxmodel.frequency_response import (
+from jaxmodel.modal_loop import law_poles, law_response
+from jaxmodel.mode_tail import bound_tail, static_rest
+from jaxmodel.prepare import prepare
+from jaxmodel.sampled_response import (
     SampledLoopResponse,
     command_gain,
     plant_images,
     plant_response,
 )
-from jaxmodel.modal_loop import law_poles, law_response
-from jaxmodel.mode_tail import bound_tail, static_rest
-from jaxmodel.prepare import prepare
 from jaxmodel.zero_exclusion import NEAR, prepare_exclusion, return_difference
 from studies.documents import schema
 from studies.engine.controller import fixed_controller
