@@ -334,6 +334,15 @@ def frequency_response(
         output: rows over x, such as `plant.deflection`.
         source: columns, such as `plant.force`.
         frequency: [Hz].
+
+    Returns:
+        Of each frequency, from each column to each row, in their units.
+
+    Example:
+        >>> structure, case = paper_case({"link.modes": 2, "control.feedback": "none"})
+        >>> plant = linearise(structure, prepare(structure, case).loop, jnp.array(HOME))
+        >>> frequency_response(plant, plant.deflection[:1], plant.force[:, :1], [90.0]).shape
+        (1, 1, 1)
     """
     eye = jnp.eye(plant.state.shape[0])
 

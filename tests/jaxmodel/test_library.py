@@ -341,7 +341,11 @@ def test_a_batch_on_four_devices_is_that_on_one():
 FUNCTIONS = [x for x in jaxmodel.__all__ if inspect.isfunction(getattr(jaxmodel, x))]
 
 
-@pytest.mark.long  # in short: their functions have tests of their own
+def test_every_public_function_has_an_example():
+    assert [x for x in FUNCTIONS if ">>>" not in (getattr(jaxmodel, x).__doc__ or "")] == []
+
+
+@pytest.mark.long  # in short: the one above
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_every_public_function_has_an_example_that_runs(name):
     one = getattr(jaxmodel, name)
