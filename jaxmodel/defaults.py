@@ -25,10 +25,6 @@ from jaxmodel.table import PartError
 
 #: Its number, or one a link, is that of mode 1; those of other fields are the same for all modes.
 OF_MODE_1 = "control.damping"
-#: Modes of a link that can be under control.
-_MOST_CONTROLLED = 12
-#: Stands for a value that is not given.
-PAPERS = object()
 #: One number for each patch, which follows the placement.
 _OF_PATCHES = ("patches.sensor_factor", "patches.actuator_factor")
 
@@ -65,9 +61,8 @@ def paper_case(
         >>> float(jax.jit(gain)(2.0))
         2.0
     """
-    given, numbers = dict(values or {}), dict[str, Any]()
-    for name, field in fields().items():
-        numbers[name] = _number(name, field, given.get(name, PAPERS))
+    given, forms = dict(values or {}), dict(fields())
+    numbers = {name: _number(name, form, given) for name, form in forms.items()}
 
     def value(name: str) -> Any:
         number = numbers[name]
@@ -86,7 +81,7 @@ def paper_case(
             name = f"{place}.{part.name}.{x.name}"
             own = {"value": [x.default] * links[0], "shape": links, "unit": x.unit}
             own |= {"allowed": f"{x.low:g} to {x.high:g}", "limits": {"ge": x.low, "le": x.high}}
-            numbers[name] = _number(name, own, given.get(name, PAPERS))
+            forms[name], numbers[name] = own, _number(name, own, given)
     for name in given.keys() - numbers.keys():
         _refuse(name, numbers)
     moves = len(numbers["motion.waypoints"]) - 1
@@ -97,13 +92,9 @@ def paper_case(
         check_shape("machine.joint_angles_deg", numbers["machine.joint_angles_deg"], links)
     n_patches = np.shape(numbers["patches.centers"])[-1]
     for name in _OF_PATCHES:
-        factor = given.get(name, 1.0)
-        own = {
-            **fields()[name],
-            "value": [[1.0] * n_patches] * links[0],
-            "shape": (*links, n_patches),
-        }
-        numbers[name] = _number(name, own, factor)
+        ones = np.ones((*links, n_patches))
+        own = forms[name] | {"value": ones, "shape": ones.shape}
+        numbers[name] = _number(name, own, given)
         check_shape(name, numbers[name], (*links, n_patches))
     sizes = {
         "n_modes": _size(numbers, "link.modes", "n_modes", n_modes),
@@ -114,7 +105,7 @@ def paper_case(
     }
     # a case with a traced number that is not allowed has no length, and its status says so
     is_fine = [
-        jnp.all(_is_allowed(fields().get(name, {}), x))
+        jnp.all(_is_allowed(forms[name], x))
         for name, x in given.items()
         if isinstance(x, jax.core.Tracer)
     ]
@@ -149,7 +140,7 @@ def _size(numbers: Numbers, name: str, argument: str, most: int) -> int:
     """The largest of a number of modes: as said, or its value."""
     field, value = fields()[name], numbers[name]
     if most:
-        _number(argument, field, most)
+        _number(argument, field, {argument: most})
     elif isinstance(value, jax.core.Tracer):
         raise PartError(f"{argument}: missing; expected the largest {name}, which is traced")
     if most and not isinstance(value, jax.core.Tracer) and value > most:
@@ -157,11 +148,12 @@ def _size(numbers: Numbers, name: str, argument: str, most: int) -> int:
     return int(most or value)
 
 
-def _number(name: str, field: dict[str, Any], value: Any) -> Array:
-    """A field's array: a value in the shape that the field has, or the paper's."""
+def _number(name: str, field: dict[str, Any], given: Mapping[str, Any]) -> Array:
+    """A field's array: a given value in the shape that the field has, or the paper's."""
     own = np.array(field["value"], field.get("dtype", float)).reshape(field["shape"])
-    if value is PAPERS:
+    if name not in given:
         return own
+    value = given[name]
     if isinstance(value, jax.core.Tracer):
         if "choices" in field:
             raise PartError(f"{name}: traced; expected a value that is known before")
@@ -192,7 +184,8 @@ def _shaped(name: str, of: str | None, own: tuple[int, ...], value: Any) -> Arra
     if of and len(shape) == len(own):  # as long as written
         target = (shape[0], *own[1:]) if of == "entries" else (own[0], *shape[1:])
     elif of == "each link":
-        value, target = value[..., None], (own[0], 1 if name == OF_MODE_1 else _MOST_CONTROLLED)
+        most = int(fields()["control.modes"]["limits"]["le"])
+        value, target = value[..., None], (own[0], 1 if name == OF_MODE_1 else most)
     elif of == "all links" and shape:
         target = (own[0], *shape)
     is_flat = of in ("entries", "lists") and 0 < len(shape) < len(own)

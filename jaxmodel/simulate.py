@@ -31,7 +31,7 @@ class RunResult(NamedTuple):
     # NaN if the run did not finish; derivatives are 0 then, so that a sum over the cases of a batch
     # that masks those by `status` has the right derivative
     metrics: metrics.Metrics
-    status: Int[Array, ""]  # 0: ok; others, by `jaxmodel.status.REASONS`: why there are no metrics
+    status: Int[Array, ""]  # 0: ok; others: see `REASONS` and `FINISHED` of `jaxmodel.status`
     bad_time: Num[Array, ""]  # when it appeared [s], 0 if OK or wrong from the start
     command_end: Num[Array, ""]  # end of the shaped reference [s]
     sensor_condition: Num[Array, "links"]  # condition number of the modal filter per link [1]

@@ -363,3 +363,12 @@ def test_no_module_has_the_name_of_something_public():
     homes = {name: getattr(jaxmodel, name).__module__ for name in FUNCTIONS}
     modules = {x.stem for x in Path(jaxmodel.__file__).parent.glob("*.py")}
     assert {x for x, home in homes.items() if x in modules and home != f"jaxmodel.{x}"} == set()
+
+
+def test_a_traced_number_of_a_law_is_checked_too():
+    def length(damping):
+        values = {"control.law": "ppf", "control.laws.ppf.filter_damping": damping}
+        return paper_case(values)[1].machine.beam.length
+
+    length = jax.jit(length)
+    assert np.isfinite(length(0.4)).all() and np.isnan(length(-0.4)).all()
