@@ -17,9 +17,9 @@ from studies.export.run import DAC_BITS
 from studies.export.targets import TARGETS
 from studies.fitting.spec import FitSpec, parse_fit
 from studies.laws.candidates import RATIOS, law_candidate
-from studies.space.axes import parse_section
 from studies.space.machines import MISMATCHES
 from studies.study.files import find_spec, read_toml
+from studies.study.paths import parse_section
 from studies.study.spec import Section, Study, described
 from studies.tuning.spec import Tune, parse_tuning
 

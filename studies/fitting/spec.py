@@ -10,8 +10,6 @@ import hashlib
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from pydantic import ValidationError
-
 from studies.engine.preflight import check_machine, check_run
 from studies.errors import StudyError, field_error, nearest, shown_name
 from studies.fitting.kinds.contract import DataEntry
@@ -24,16 +22,17 @@ from studies.fitting.kinds.settling import SettlingEntry
 from studies.fitting.kinds.spectrum import SpectrumEntry
 from studies.fitting.kinds.trace import TraceEntry
 from studies.show.units import headed, readable
-from studies.space.axes import Finite, Range, WrittenRange, parse_range
+from studies.space.axes import Finite, Range, WrittenRange
 from studies.space.free import (
+    Free,
     FreeNumbers,
+    Place,
     check_twice,
     join_numbers,
     plain_numbers,
 )
-from studies.study.explain import explain
 from studies.study.files import find_spec, read_toml
-from studies.study.paths import as_tuples, field_unit, parse_entry
+from studies.study.paths import field_unit, parse_entry, parse_section
 from studies.study.signals import INPUTS, OUTPUTS, Signal, parse_signal
 from studies.study.sizes import lengths
 from studies.study.spec import (
@@ -194,10 +193,7 @@ def parse_fit(data: dict[str, Any], folder: str | Path = ".") -> FitSpec:
         raise StudyError("fit: missing; a fit is a study file with a section [fit]")
     study = parse_study({name: value for name, value in data.items() if name != "fit"})
     sizes = lengths(study.mechanism)
-    try:
-        fit = Fit.model_validate(as_tuples(data["fit"]), context=sizes)
-    except ValidationError as error:
-        raise explain(error, Fit, data["fit"], "fit", sizes) from None
+    fit = parse_section(Fit, data["fit"], "fit", sizes)
     if any(written.get("kind") in MOTIONS for written in fit.data):
         study = with_window(study)
         check_run(study)
@@ -223,14 +219,14 @@ def parse_fit(data: dict[str, Any], folder: str | Path = ".") -> FitSpec:
 def _free(fit: Fit, study: Study) -> tuple[FreeNumbers, tuple[Prior, ...]]:
     if not fit.free:
         raise field_error("fit.free", {}, "one free field or more")
-    parts, priors = list[Any](), list[Prior]()
+    parts, priors = list[tuple[list[Free], Place]](), list[Prior]()
     for name, written in fit.free.items():
         path = f"fit.free.{shown_name(name)}"
-        first, form = sum(len(numbers) for numbers, _ in parts), WrittenPrior
-        roles = DESIGN, MACHINE
-        parts.append(plain_numbers(name, written, study, path, roles, form=form))
-        known = _prior(*parse_range(written, path, form), path)
-        priors += [Prior(first + k, *known) for k in range(len(parts[-1][0])) if known]
+        first, roles = sum(len(numbers) for numbers, _ in parts), (DESIGN, MACHINE)
+        numbers, place = plain_numbers(name, written, study, path, roles, form=WrittenPrior)
+        parts.append((numbers, place))
+        known = _prior(parse_section(WrittenPrior, written, path), numbers[0].span, path)
+        priors += [Prior(first + k, *known) for k in range(len(numbers)) if known]
     free = join_numbers(parts)
     check_twice(free.numbers, "fit.free")
     return free, tuple(priors)
@@ -260,7 +256,7 @@ def shown_value(name: str, value: float, digits: str = ".4g") -> str:
     return f"{factor * value:{digits}} {unit}".rstrip()
 
 
-def _prior(span: Range, known: WrittenPrior, path: str) -> tuple[float, float] | None:
+def _prior(known: WrittenPrior, span: Range, path: str) -> tuple[float, float] | None:
     """Mean and standard deviation of what is known of a number beforehand."""
     if (known.mean, known.sigma) == (None, None):
         return None
@@ -281,10 +277,7 @@ def _entry(written: dict[str, object], k: int, study: Study) -> DataEntry:
         hint = nearest(kind, ENTRIES) if isinstance(kind, str) else ""
         raise field_error(f"{path}.kind", kind, ", ".join(ENTRIES), hint=hint)
     model, sizes = ENTRIES[kind], lengths(study.mechanism)
-    try:
-        entry = model.model_validate(as_tuples(written), context=sizes)
-    except ValidationError as error:
-        raise explain(error, model, written, path, sizes) from None
+    entry = parse_section(model, written, path, sizes)
     is_bare = isinstance(entry, NoiseEntry) and entry.sigma is None and entry.sigma_percent is None
     if is_bare:
         raise StudyError(

@@ -9,17 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import combinations, product
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from jaxmodel.laws.state_space import STATE_SPACE
 from studies.errors import field_error, nearest, shown_name
 from studies.study.consistency import patch_centers, patch_pitch
-from studies.study.explain import explain
 from studies.study.fields import Columns, column_of
-from studies.study.paths import as_tuples, checked_value, field_choices, known_field
+from studies.study.paths import checked_value, field_choices, known_field, parse_section
 from studies.study.section import Section, described
 from studies.study.spec import Study
 
@@ -128,7 +127,7 @@ def _field_axis(name: str, written: Any, study: Study, path: str) -> Axis:
     if written == "all":
         written = _every_choice(name, base, path, study)
     if isinstance(written, dict):
-        return _range_axis(name, base, parse_range(written, path, WrittenGrid)[0], study, path)
+        return _range_axis(name, base, parse_range(written, path), study, path)
     if not isinstance(written, list | tuple) or not written:
         raise field_error(path, written, _WRITTEN)
     values = column_of([checked_value(study, name, value, path) for value in written])
@@ -183,26 +182,8 @@ class WrittenGrid(WrittenRange):
     count: int = described(0, "1", "of points for grid and zip; 0: none", ge=0, le=LIMIT)
 
 
-T = TypeVar("T", bound=Section)
-
-
-def parse_section(model: type[T], written: object, path: str) -> T:
-    """A section that is written at a place.
-
-    Raises:
-        StudyError: a field that it has not, or a value that is not allowed.
-    """
-    try:
-        return model.model_validate(as_tuples(written))
-    except ValidationError as error:
-        raise explain(error, model, written, path) from None
-
-
-R = TypeVar("R", bound=WrittenRange)
-
-
-def parse_range(written: object, path: str, model: type[R]) -> tuple[Range, R]:
-    """A range, and all that is written there.
+def parse_range(written: object, path: str, model: type[WrittenRange] = WrittenGrid) -> Range:
+    """The range that is written at a place.
 
     Raises:
         StudyError: no range, or one without numbers between its ends.
@@ -213,7 +194,7 @@ def parse_range(written: object, path: str, model: type[R]) -> tuple[Range, R]:
         raise field_error(f"{path}.to", high, f"more than {path}.from = {low:g}")
     if found.scale == "log" and low <= 0:
         raise field_error(f"{path}.from", low, "more than 0 on a log scale")
-    return Range(low, high, getattr(found, "count", 0), found.scale == "log"), found
+    return Range(low, high, getattr(found, "count", 0), found.scale == "log")
 
 
 def _range_axis(name: str, base: Any, span: Range, study: Study, path: str) -> Axis:
@@ -257,7 +238,7 @@ def _map_axis(axis: Axis, convert: Callable[[np.ndarray], Columns], name: str) -
 def _numbers_axis(written: Any, path: str) -> Axis:
     """Free numbers, named "value"."""
     if isinstance(written, dict):
-        span, _ = parse_range(written, path, WrittenGrid)
+        span = parse_range(written, path)
         return _numeric_axis("value", span, span.at)
     is_list = isinstance(written, list | tuple) and len(written) > 0
     if not is_list or not all(map(_is_number, written)):
@@ -326,7 +307,8 @@ class WrittenPlacement(Section):
 
 
 def _placement(written: Any, study: Study, path: str) -> Axis:
-    kind, candidates = dict(parse_section(WrittenPlacement, written, path)).values()
+    asked = parse_section(WrittenPlacement, written, path)
+    kind, candidates = asked.kind, asked.candidates
     count = patch_centers(study).shape[1]
     lengths, pitches = study.each_link(study.link.length), patch_pitch(study)
     if kind == "per_link":

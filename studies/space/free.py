@@ -179,7 +179,7 @@ def plain_numbers(
             + (f"; did you mean {hint!r}?" if hint else "")
         )
     _check_field(entry.field, study, path)
-    span, _ = parse_range(written, path, form)
+    span = parse_range(written, path, form)
     numbers, positions = [], []
     for indices, start in numbers_in(value):
         whole = (*entry.indices, *indices)

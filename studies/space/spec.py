@@ -19,12 +19,12 @@ from pydantic import Field
 from jaxmodel.loop_figures import HIGHEST, MARGINS, PEAKS
 from studies.errors import StudyError, field_error, nearest
 from studies.reading import check_depth
-from studies.space.axes import parse_section
 from studies.space.methods import METHODS
 from studies.study.choices import OWN, OneOf
 from studies.study.entries import entry_sizes, parse_entries
 from studies.study.files import read_toml
 from studies.study.margin import ENOUGH
+from studies.study.paths import parse_section
 from studies.study.spec import Section, Study, described, parse_study
 from studies.study.window import with_window
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -28,7 +28,8 @@ from studies.study.consistency import (
     check_own_fields,
     patch_centers,
 )
-from studies.study.explain import choices_of, unit_of
+from studies.study.explain import choices_of, explain, unit_of
+from studies.study.section import Section
 from studies.study.sizes import alternatives, depth, has_one_a_link
 from studies.study.spec import (
     OWN_FIELDS,
@@ -37,6 +38,7 @@ from studies.study.spec import (
     validate,
 )
 
+T = TypeVar("T", bound=Section)
 #: An index that names its axis and counts from 1, as in the files: `residual_rms[link=1]`.
 NAMED_INDEX = re.compile(r"\[(\w+)=(\d{1,6})\]")
 _ENTRY = re.compile(r"(?P<field>[^\s\[\]]+)(?P<indices>(\[(0|[1-9]\d{0,5})\])*)")
@@ -293,6 +295,26 @@ def _check_exchange(study: Study, changed: Study, path: str) -> None:
 def overlaps(name: str, other: str) -> bool:
     """Whether one field is the other or an entry of it."""
     return name == other or name.startswith(f"{other}[") or other.startswith(f"{name}[")
+
+
+def parse_section(
+    model: type[T], written: Any, path: str, sizes: Mapping[str, int] | None = None
+) -> T:
+    """A section that is written at a place.
+
+    Args:
+        model: of the section.
+        written: what stands there.
+        path: the place, for messages.
+        sizes: lengths of lists with one entry for each of something, if they are known.
+
+    Raises:
+        StudyError: a field that it has not, or a value that is not allowed.
+    """
+    try:
+        return model.model_validate(as_tuples(written), context=sizes)
+    except ValidationError as error:
+        raise explain(error, model, written, path, sizes) from None
 
 
 def as_tuples(value: Any) -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxmodel.numbers import Numbers
 from jaxmodel.parameters import Array
 from studies.errors import StudyError, field_error, shown_name
-from studies.space.axes import Range, parse_section
+from studies.space.axes import Range
 from studies.space.free import (
     Free,
     FreeNumbers,
@@ -27,7 +27,7 @@ from studies.space.free import (
     plain_numbers,
 )
 from studies.study.consistency import patch_centers, patch_pitch
-from studies.study.paths import Parts
+from studies.study.paths import Parts, parse_section
 from studies.study.section import DESIGN, Section, described
 from studies.study.spec import Study
 

@@ -31,7 +31,6 @@ from jaxmodel.metrics import METRICS
 from jaxmodel.numbers import SWITCHES
 from studies.engine.preflight import check_run
 from studies.errors import StudyError, field_error, nearest, shown, shown_name
-from studies.space.axes import parse_section
 from studies.space.free import FreeNumbers
 from studies.study.cases import build_structure
 from studies.study.entries import controlled_links, entry_sizes, parse_entries
@@ -42,6 +41,7 @@ from studies.study.paths import (
     is_each_link,
     known_field,
     overlaps,
+    parse_section,
     parts_of,
     set_value,
     set_values,

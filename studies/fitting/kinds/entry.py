@@ -14,7 +14,7 @@ from studies.fitting.kinds.contract import DataEntry, Models, Noise
 from studies.fitting.kinds.motions import RECORDED
 from studies.fitting.tables import column, read_columns
 from studies.fitting.uff import Side
-from studies.study.cases import build_structure
+from studies.study.consistency import patch_centers
 from studies.study.signals import INPUTS, OUTPUTS, Signal, parse_signal
 from studies.study.spec import Pose, Section, Study, described
 
@@ -157,7 +157,7 @@ class ShakenEntry(OutputEntry, FileEntry, PoseEntry):
 
 def signal_sizes(study: Study) -> tuple[int, np.ndarray]:
     """Patches of a link, and length of the links [m]: what names of signals are checked by."""
-    return build_structure(study).n_patches, study.each_link(study.link.length)
+    return patch_centers(study).shape[1], study.each_link(study.link.length)
 
 
 def check_drive(study: Study, kinds: set[str], what: str) -> None:

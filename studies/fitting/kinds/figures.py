@@ -44,16 +44,16 @@ class FiguresEntry(DataEntry, NoiseEntry):
         if switch.modes > control.modes:
             allowed = f"1 to control.modes = {control.modes}"
             raise field_error(f"{path}.modes", switch.modes, allowed)
-        entries, sigma = [], []
+        entries, sigma = dict[str, Entries](), []
         for name, value in self.values.items():
-            entries.append(parse_entries(name, f"{path}.values", entry_sizes(models.study)))
+            one = parse_entries(name, f"{path}.values", entry_sizes(models.study))
+            entries[name] = one
             if self.amplitude and self.of != "reduction" and value < 0:
                 allowed = "0 or more where amplitude = true"
                 raise field_error(f"{path}.values.{name}", value, allowed)
-            if not METRICS[entries[-1].metric].is_differentiable:
+            if not METRICS[one.metric].is_differentiable:
                 smooth = [x for x in METRICS if METRICS[x].is_differentiable]
-                is_settling = entries[-1].metric == "settling_time"
-                hint = "; take kind = 'settling'" if is_settling else ""
+                hint = "; take kind = 'settling'" if one.metric == "settling_time" else ""
                 raise StudyError(
                     f"{path}.values: {name!r} has no derivative{hint}; allowed: {', '.join(smooth)}"
                 )
@@ -73,30 +73,31 @@ class Figures(Measurement):
         entry: FiguresEntry,
         runs: Runs,
         switch: Switch,
-        entries: list[Entries],
+        entries: dict[str, Entries],
         sigma: np.ndarray,
     ) -> None:
         super().__init__(entry, np.array(list(entry.values.values())), sigma)
         self._entry, self._runs, self._switch, self._entries = entry, runs, switch, entries
         self._is_reduction = entry.of == "reduction"
         root, power = ("root of ", "^(1/2)") if entry.amplitude else ("", "")
-        for name, one in zip(entry.values, entries, strict=True):
+        for name, one in entries.items():
             unit = "%" if self._is_reduction else METRICS[one.metric].unit + power
             self.labels = (*self.labels, f"{root}{name} [{unit}]")
             runs.add(one.metric, switch, *[switch.off] * self._is_reduction)
 
     def predict(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
         outcome = self._runs.run(values, has_slopes)
-        numbers, slopes = zip(*(self._number(x, *outcome) for x in self._entries), strict=True)
+        pairs = (self._number(name, *outcome) for name in self._entries)
+        numbers, slopes = zip(*pairs, strict=True)
         return np.array(numbers), np.array(slopes) if has_slopes else None
 
-    def _number(self, one: Entries, metrics: Any, slopes: Any = None) -> tuple[Any, Any]:
+    def _number(self, name: str, metrics: Any, slopes: Any = None) -> tuple[Any, Any]:
+        one = self._entries[name]
         on, by_on = self._taken(one, self._switch, metrics, slopes)
         if not self._is_reduction:
             return on, by_on
         off, by_off = self._taken(one, self._switch.off, metrics, slopes)
         if off == 0:
-            name = list(self._entry.values)[self._entries.index(one)]
             raise StudyError(f"{self.name}: {name} is 0 without control: it has no reduction")
         by = None if slopes is None else 100 * (on * by_off / off**2 - by_on / off)
         return 100 * (1 - on / off), by
